@@ -32,6 +32,10 @@ os.environ.setdefault("NPROC", "1")
 # Where in the source each operation was written is not looked up for the compiler.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
+import jax  # noqa: E402  (it reads the settings above when it is imported)
+
+jax.config.update("jax_enable_x64", True)  # for arrays that tests make before the program does
+
 settings.register_profile(
     "orthaug",
     derandomize=True,

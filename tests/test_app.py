@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from test_cli import run, signals, write_csv
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Run, WorkerPool

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import Baseline, InputError, Parameter, Term
 from orthaug.data.expressions import Lag
-from orthaug.physics.baseline import Baseline, Parameter, Term
 
 LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
 X = np.random.default_rng(1).normal(size=(5, 3))

@@ -8,7 +8,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
-from orthaug.analysis import stability
+from orthaug import stability
 
 
 def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
@@ -125,7 +125,7 @@ def test_a_saved_model_holds_as_well(tmp_path):
 
 def test_the_gradient_of_a_step_is_that_of_what_is_held():
     """A linear view far outside sees the physics alone."""
-    from orthaug._base.jax import jax
+    import jax
 
     model = fitted()
     slope = np.asarray(

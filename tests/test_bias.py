@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError, RankError
+from orthaug import InputError, RankError, Record, Suspect
 from orthaug.analysis.bias import Certificate, bias_table, find_certificate
-from orthaug.analysis.suspects import Suspect, data_width, suspect_columns
-from orthaug.data.record import Record
+from orthaug.analysis.suspects import data_width, suspect_columns
 from orthaug.physics.problem import pose
 from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static

@@ -8,22 +8,29 @@ from functools import cache
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import (
+    MLP,
+    Baseline,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    PhysicalParameter,
+    PhysicsMap,
+    Record,
+    Suspect,
+    Term,
+    Terms,
+    Training,
+    Uniform,
+    bias_budget,
+    estimate,
+)
 from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
-from orthaug.analysis.budgets import bias_budget
 from orthaug.analysis.measure_bias import MeasureLinearization
 from orthaug.analysis.missing_lags import missing_lags
-from orthaug.analysis.suspects import Suspect, usual_suspects
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Orthogonal
-from orthaug.inference.measures import Training, Uniform, weigh_problem
-from orthaug.models.learners import MLP
-from orthaug.models.terms import Terms
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
+from orthaug.analysis.suspects import usual_suspects
+from orthaug.inference.measures import weigh_problem
 from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import static
 

@@ -15,6 +15,7 @@ from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # n
 from typer.testing import CliRunner
 
 import orthaug as oa
+from orthaug import MLP, BaselinePenalty, LevenbergMarquardt, Orthogonal, Stream
 from orthaug._base.folders import PARTIALS
 from orthaug._base.progress import Progress
 from orthaug.commands.cli import app
@@ -22,11 +23,7 @@ from orthaug.commands.fit import fit_job, keep_states, write_result
 from orthaug.commands.kinds import open_job
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.estimation import fit
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import BaselinePenalty, Orthogonal
-from orthaug.models.learners import MLP
 from orthaug.models.rows import InMemory
-from orthaug.models.streaming import Stream
 from orthaug.physics.problem import pose
 
 

@@ -16,11 +16,10 @@ import pandas as pd
 import pytest
 
 import orthaug
+from orthaug import load, read_record
 from orthaug.commands import cli
-from orthaug.data.readers import read_record
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.status import Ending
-from orthaug.models.storage import load
 from orthaug.reports.result import ScoreResult
 
 SPEC = """

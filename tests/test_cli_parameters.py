@@ -10,9 +10,8 @@ import pandas as pd
 import pytest
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
-from orthaug import load_spec
+from orthaug import load, load_spec
 from orthaug.inference.covariance import interval
-from orthaug.models.storage import load
 from orthaug.studies.synthetic import MassSpringDamper
 
 TRUE = {"m": 1.0, "cd": 100.0, "ks": 1000.0}

@@ -8,21 +8,28 @@ from __future__ import annotations
 from functools import cache
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    EquinoxModule,
+    Function,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    Record,
+    Term,
+    estimate,
+    orthogonalize,
+)
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.models.learners import MLP, EquinoxModule, Function
-from orthaug.physics.baseline import Baseline, Term
 
 REGRESSORS = {
     1: ("y[k-1]", "u[k]", "u[k-1]", "1", "y[k-1]**3", "sin(2*u[k])", "y[k-1]*u[k-1]", "abs(u[k])"),

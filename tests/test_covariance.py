@@ -9,12 +9,8 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term, estimate
 from orthaug.inference.covariance import interval, noise_covariance
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.studies.synthetic import NOISE_30_DB, static
 
 ROWS = 60

@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import Baseline, InputError, Record, Suspect, Term, design_input
 from orthaug.analysis import signals
 from orthaug.analysis.bias import bias_table
-from orthaug.analysis.design import Design, design_input
-from orthaug.analysis.suspects import Suspect, suspect_columns
-from orthaug.data.record import Record
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.analysis.design import Design
+from orthaug.analysis.suspects import suspect_columns
 from orthaug.physics.problem import pose
 from orthaug.reports.result import DesignResult
 from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper

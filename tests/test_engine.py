@@ -6,24 +6,35 @@ import threading
 from dataclasses import dataclass, field
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Function,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Simulation,
+    Stream,
+    Term,
+    estimate,
+)
 from orthaug.data.sources import RecordSource
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate, fit
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.estimation import fit
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Bound, Function
+from orthaug.models.learners import Bound
 from orthaug.models.rows import Engine, InMemory, MixedGram, Overlaps
-from orthaug.models.streaming import Stream, read_ahead
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.models.streaming import read_ahead
 from orthaug.physics.problem import pose
 from orthaug.physics.streamed import streamed
 

@@ -17,12 +17,12 @@ import pandas as pd
 import pytest
 
 import orthaug as oa
+from orthaug import Stream
 from orthaug.commands.fit import fit_job
 from orthaug.commands.kinds import open_job
 from orthaug.commands.select import open_select, select_for
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness
-from orthaug.models.streaming import Stream
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -311,7 +311,7 @@ def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch
 
 
 def test_segments_on_workers_give_the_free_run_of_rows_in_memory(folder, in_memory, cluster):
-    from orthaug.models.cluster import Dask
+    from orthaug import Dask
 
     check_flown(told_of(flown_lagged(opened(folder), Dask(cluster))), in_memory["lagged"])
     check_flown(told_of(flown_motion(from_files(folder), Dask(cluster))), in_memory["motion"])
@@ -394,7 +394,7 @@ folder = pathlib.Path({folder!r})
 (folder / "devices.json").write_text(json.dumps(t.fitted(folder, "devices", more="devices = 3")))
 for kind, fly in (("lagged", t.flown_lagged), ("motion", t.flown_motion)):
     (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(fly(t.from_files(folder), Devices()))))
-from orthaug._base.jax import jax
+import jax
 assert len(jax.devices()) == 4
 """
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError, RankError
+from orthaug import Baseline, InputError, RankError, Record, Term, identifiability
 from orthaug.data.expressions import Lag
-from orthaug.data.record import Record
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.excitation import excitation, identifiability, require_rank
+from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.problem import pose
 from orthaug.physics.projection import Projection
 

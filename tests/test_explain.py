@@ -10,10 +10,9 @@ import pytest
 from test_cli import one_line, run, write_csv
 
 import orthaug as oa
-from orthaug._base.errors import InputError
+from orthaug import InputError, Output, State
 from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
-from orthaug.physics.motion import Output, State
 from orthaug.selection.explaining import _written, candidates_of
 from orthaug.selection.explanation import NewTerm, added_to_motion
 from orthaug.selection.learned_linearization import MotionResponse, _moved, linearization_of

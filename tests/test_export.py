@@ -15,11 +15,13 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import orthaug as oa
-from orthaug._base.jax import jax, jnp
+from orthaug import Baseline, Model, MotionModel, Terms, numpy_step
 from orthaug.commands.cli import main
 from orthaug.data.expressions import FUNCTIONS, parse, parse_named
 from orthaug.data.regressors import Features
@@ -28,16 +30,12 @@ from orthaug.export.kinds import TARGETS
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
 from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
-from orthaug.export.numpy_step import NumpyStep, numpy_step
+from orthaug.export.numpy_step import NumpyStep
 from orthaug.models.beyond import pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
-from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import MotionDynamics
-from orthaug.models.terms import Terms
-from orthaug.physics.baseline import Baseline
 
 POINTS, STEPS = 1000, 10_000
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")

@@ -5,30 +5,37 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    Baseline,
+    Function,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Record,
+    Term,
+    estimate,
+    load,
+    orthogonalize,
+    save,
+    stability,
+)
 from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
 from orthaug.analysis import lipschitz as gradients
 from orthaug.analysis.boundedness import divergence_scaling
 from orthaug.analysis.contraction import contraction
 from orthaug.analysis.feedback import feedback
-from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.lipschitz import lipschitz
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags, stack_rows
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.data.regressors import stack_rows
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Parts
-from orthaug.models.learners import MLP, Function
-from orthaug.models.model import Model
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import StabilityResult
 
 FEW = LevenbergMarquardt(iterations=5)

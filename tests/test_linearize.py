@@ -15,7 +15,7 @@ from test_cli import one_line, run
 from test_surface import WRONG, tried
 
 import orthaug as oa
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.analysis.linear_system import System, converted, modes_of, observer_form
 from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag

@@ -11,12 +11,11 @@ import pytest
 from test_free_run import PHYSICS, nonlinear
 
 import orthaug as oa
+from orthaug import Orthogonal, Stream
 from orthaug._base.progress import StopTraining
 from orthaug.fitting import one_step
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.structures import Orthogonal
 from orthaug.fitting.training import planned
-from orthaug.models.streaming import Stream
 from orthaug.physics.problem import pose
 
 ROWS, LM, NETWORK = 4000, oa.LevenbergMarquardt(100), oa.MLP(hidden=(3,))

@@ -11,11 +11,7 @@ import pytest
 from helpers import unfolded
 from test_cli import finite_json, one_line, run
 
-from orthaug._base.errors import InputError
-from orthaug.data.readers import read_record
-from orthaug.fitting.estimation import estimate
-from orthaug.models.storage import load
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import Baseline, InputError, Term, estimate, load, read_record
 from orthaug.physics.problem import pose
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])

@@ -8,13 +8,17 @@ import naive
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Baseline,
+    Channel,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.reports.result import ScoreResult
 
 FEW = LevenbergMarquardt(iterations=5)

@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,12 +19,10 @@ from helpers import unfolded
 from test_export import moving
 
 import orthaug as oa
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
+from orthaug import InputError, read_record
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.commands import cli
 from orthaug.commands.kinds import open_job
-from orthaug.data.readers import read_record
 from orthaug.models.motion_field import parts_at
 
 SPEC = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 import scipy.integrate
@@ -12,7 +13,6 @@ import scipy.signal
 
 import orthaug as oa
 import orthaug.fitting.segments as laid
-from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Numbers

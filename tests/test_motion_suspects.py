@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_motion_fit import WHOLE, data, positive, spring
 
 import orthaug as oa
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
+from orthaug import InputError
 from orthaug.analysis.budget import AS_MUCH
 from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
 from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import problem
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
+from orthaug import MLP, Baseline, Function, LevenbergMarquardt, Record, Term
 from orthaug.fitting.normal_equations import Hold
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
-from orthaug.models.learners import MLP, Function
 from orthaug.models.rows import Overlap
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 CASES = [(ny, nt) for ny in (1, 2) for nt in (0, 1, 3)]

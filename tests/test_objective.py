@@ -5,21 +5,27 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import jax
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax
-from orthaug.data.record import Record
-from orthaug.fitting.criteria import Simulation
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Simulation,
+    Term,
+)
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
 from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import mass_spring_damper
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthaug import Model
 from orthaug.commands import demo
 from orthaug.commands.cli import main
 from orthaug.data import regressors
-from orthaug.models.model import Model
 from orthaug.physics import problem
 from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import mass_spring_damper

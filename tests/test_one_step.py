@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug import (
+    MLP,
+    Baseline,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+)
 from orthaug.fitting.one_step import OUTPUT_UNIT, OneStepTask
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Scaling
+from orthaug.models.learners import Scaling
 from orthaug.models.rows import from_chunks
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import mass_spring_damper
 

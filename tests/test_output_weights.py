@@ -8,17 +8,23 @@ import numpy as np
 import pytest
 from test_cli import finite_json, run
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Record
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate, reweighted
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, OrthogonalPenalty
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    InputError,
+    LevenbergMarquardt,
+    OrthogonalPenalty,
+    Record,
+    Simulation,
+    Term,
+    Uniform,
+    estimate,
+    load,
+    save,
+)
+from orthaug.fitting.estimation import reweighted
 from orthaug.inference.covariance import joint_covariance
-from orthaug.inference.measures import Uniform
-from orthaug.models.learners import MLP
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 ROWS = 300

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.data.record import Record
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    LevenbergMarquardt,
+    Record,
+    Term,
+    estimate,
+    orthogonalize,
+)
 from orthaug.physics.projection import Projection
 from orthaug.studies.synthetic import mass_spring_damper, static
 

@@ -13,14 +13,9 @@ import pytest
 import scipy.linalg  # noqa: F401  (brings a BLAS of its own)
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from orthaug import MLP, AdamLBFGS, Baseline, LevenbergMarquardt, Record, Term, estimate
 from orthaug._base import parallel
 from orthaug._base.parallel import RunCancelled, one_blas_thread, spread
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 
 
 @pytest.fixture

@@ -9,11 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    BaselinePenalty,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    estimate,
+)
 from orthaug.studies.synthetic import mass_spring_damper
 
 PIPELINE = AdamLBFGS(

@@ -6,6 +6,8 @@ import json
 import math
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
@@ -13,13 +15,11 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import Baseline, InputError, PhysicalParameter, PhysicsMap, Term
 from orthaug.data.expressions import FUNCTIONS, Expression
 from orthaug.inference.covariance import interval
 from orthaug.inference.physical import profile, solve
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.parameters import PhysicalParameter, PhysicsMap, check_baseline, with_initial
+from orthaug.physics.parameters import check_baseline, with_initial
 from orthaug.reports.result import physical_rows
 
 GAMMA = "(m + cd*Ts + ks*Ts**2)"

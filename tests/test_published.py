@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Bound
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+)
+from orthaug.models.learners import Bound
 from orthaug.physics.problem import pose
 from orthaug.studies.common import trained
 from orthaug.studies.published import Data, initial_weights, loss

@@ -8,25 +8,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from annotated_types import Ge, Gt
 from test_cli import SPEC, finite_json, make_project, one_line, run
 
-from orthaug._base.errors import InputError, KeyedError
-from orthaug._base.jax import jnp
+from orthaug import (
+    AdamLBFGS,
+    InputError,
+    LevenbergMarquardt,
+    Prediction,
+    Simulation,
+    Training,
+    load,
+    read_record,
+)
+from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
 from orthaug.commands.spec import load_spec
-from orthaug.data.readers import read_record
-from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import PenaltyRows
 from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measures import Measure, Points, Training
+from orthaug.inference.measures import Measure, Points
 from orthaug.models.kinds import LEARNERS
-from orthaug.models.storage import load
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

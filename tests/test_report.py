@@ -18,12 +18,11 @@ from test_motion_cli import SPEC as MOTION
 from test_motion_cli import put
 
 import orthaug as oa
+from orthaug import Channel, Response, Trajectory
 from orthaug.commands.compare import compare_report
 from orthaug.commands.fit import fit_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
-from orthaug.data.record import Channel
-from orthaug.models.response import Response, Trajectory
 from orthaug.reports.findings import BiasResult
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page

@@ -26,7 +26,7 @@ import pandas as pd
 import pytest
 from test_cli import run as run_command
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.studies.common import Counts, Finding, extremes, panels, scripts_bars, whiskers
 from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (

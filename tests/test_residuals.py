@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 from scipy.signal import lfilter
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse

@@ -8,18 +8,28 @@ import numpy as np
 import pytest
 from test_cli import run
 
-from orthaug._base.errors import InputError, RankError
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.inference.measures import Samples, Symmetrized, Training, Uniform, Weighted
-from orthaug.models.learners import MLP
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    RankError,
+    Record,
+    Samples,
+    Simulation,
+    Symmetrized,
+    Term,
+    Training,
+    Uniform,
+    Weighted,
+    estimate,
+    load,
+    orthogonalize,
+    save,
+)
 from orthaug.reports.result import MeasureResult
 from orthaug.studies.synthetic import static
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import KINDS, Suspect, data_width, suspect_columns, usual_suspects
+from orthaug import Baseline, InputError, Record, Suspect, Term
+from orthaug.analysis.suspects import KINDS, data_width, suspect_columns, usual_suspects
 from orthaug.data.expressions import Lag, parse
-from orthaug.data.record import Record
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 from orthaug.studies.synthetic import MassSpringDamper
 

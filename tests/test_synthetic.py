@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Record
+from orthaug import InputError, Record
 from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static
 
 

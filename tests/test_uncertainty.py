@@ -4,28 +4,36 @@ from __future__ import annotations
 
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    Function,
+    InputError,
+    LevenbergMarquardt,
+    OrthogonalPenalty,
+    Record,
+    Samples,
+    Simulation,
+    Term,
+    Training,
+    Uniform,
+    estimate,
+    orthogonalize,
+    prediction_std,
+)
 from orthaug.analysis.robustness import robust_where_asked
-from orthaug.data.record import Record
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import (
     interval,
     joint_covariance,
     newey_west,
-    prediction_std,
     robust_split_covariance,
 )
-from orthaug.inference.measures import Samples, Training, Uniform
-from orthaug.models.learners import MLP, Function
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.studies.synthetic import NOISE_30_DB, static
 
 RIDGE = 1e-4

@@ -12,7 +12,7 @@ import scipy.io
 import scipy.sparse
 from test_cli import run, signals
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.data.tables import column_names, has_column
 from orthaug.data.variables import read_variables
 

@@ -9,7 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import (
+    MLP,
+    Baseline,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.analysis.validation import (
     Extrapolation,
     Trial,
@@ -21,15 +31,9 @@ from orthaug.analysis.validation import (
     judge,
     trial_on,
 )
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags, stack_rows
-from orthaug.fitting.estimation import estimate
+from orthaug.data.regressors import stack_rows
 from orthaug.fitting.held_out import blocked
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
-from orthaug.models.learners import MLP
-from orthaug.models.model import Model
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import ValidationResult
 
 pytestmark = pytest.mark.usefixtures("without_figures")
