@@ -25,6 +25,7 @@ from orthaug import (
     Uniform,
     bias_budget,
     estimate,
+    synthetic,
 )
 from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
 from orthaug.analysis.measure_bias import MeasureLinearization
@@ -32,7 +33,6 @@ from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.suspects import usual_suspects
 from orthaug.inference.measures import weigh_problem
 from orthaug.physics.problem import pose
-from orthaug.studies.synthetic import static
 
 LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "u[k-1]")])
 THETA, SIZE, VELOCITY = np.array([1.2, -0.5, 0.3]), 0.02, "y[k-1]-y[k-2]"
@@ -109,7 +109,7 @@ def test_no_cause_is_named_where_hardly_a_row_is_left_over(rows, named):
 def test_the_papers_data_sets():
     """Sets 2 and 3 are biased by the square, by 8 and 14 % of θ₃; set 1 is not. The bias told is within a tenth."""
     for number in (1, 2, 3):
-        example = static(number)
+        example = synthetic.static(number)
         fit = estimate(example.train, example.baseline, solver=LevenbergMarquardt(60))
         found = bias_budget(fit)
         assert found is not None and found.cause.suspect.name == "u[k]**2" and found.share > 0.95

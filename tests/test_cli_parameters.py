@@ -10,12 +10,11 @@ import pandas as pd
 import pytest
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
-from orthaug import load, load_spec
+from orthaug import load, load_spec, synthetic
 from orthaug.inference.covariance import interval
-from orthaug.studies.synthetic import MassSpringDamper
 
 TRUE = {"m": 1.0, "cd": 100.0, "ks": 1000.0}
-SYSTEM = MassSpringDamper()
+SYSTEM = synthetic.MassSpringDamper()
 GAMMA = "(m + cd*Ts + ks*Ts**2)"
 TERMS = """
 [data]
@@ -66,7 +65,7 @@ def machine(
     """A spec and its record of a mass, a spring and a damper; returns the spec's path."""
     rng = np.random.default_rng(4)
     force = rng.uniform(-100, 100, 1500)
-    system = SYSTEM if friction else MassSpringDamper(coulomb=0.0, static=0.0)
+    system = SYSTEM if friction else synthetic.MassSpringDamper(coulomb=0.0, static=0.0)
     position = system.simulate(force, euler(**TRUE, sign=sign), noise * rng.normal(size=1498))
     write_csv(folder / "run.csv", force=force, position=position)
     (folder / "machine.toml").write_text(spec)

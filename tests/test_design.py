@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug import Baseline, InputError, Record, Suspect, Term, design_input
+from orthaug import Baseline, InputError, Record, Suspect, Term, design_input, synthetic
 from orthaug.analysis import signals
 from orthaug.analysis.bias import bias_table
 from orthaug.analysis.design import Design
 from orthaug.analysis.suspects import suspect_columns
 from orthaug.physics.problem import pose
 from orthaug.reports.result import DesignResult
-from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper
 
-SYSTEM = MassSpringDamper()
+SYSTEM = synthetic.MassSpringDamper()
 THETA = SYSTEM.paper_theta()
 SAMPLES, NOISE, AMPLITUDE = 10_000, 0.00018, 100.0
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
@@ -31,7 +30,7 @@ FRICTION = Suspect(
         "vs": SYSTEM.stribeck,
     },
 )
-MACHINE = mass_spring_damper().baseline
+MACHINE = synthetic.mass_spring_damper().baseline
 FIRST = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]", initial=0.1)])
 
 

@@ -19,6 +19,7 @@ from orthaug import (
     Record,
     Simulation,
     Term,
+    synthetic,
 )
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
@@ -27,7 +28,6 @@ from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
 from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.status import Ending
 from orthaug.physics.problem import pose
-from orthaug.studies.synthetic import mass_spring_damper
 
 ROWS, CRITERION = 600, Simulation(64, 16, 5)
 KINDS = {
@@ -42,7 +42,7 @@ KINDS = {
 @cache
 def objective(kind="orthogonal") -> StructuredObjective:
     """On the noisy mass-spring-damper; segments have a washout, so their states are free."""
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     (experiment,) = example.train.experiments
     y = experiment.outputs + 0.02 * experiment.outputs.std() * np.random.default_rng(0).normal(
         size=(10_000, 1)

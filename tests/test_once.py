@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug import Model
+from orthaug import Model, synthetic
 from orthaug.commands import demo
 from orthaug.commands.cli import main
 from orthaug.data import regressors
 from orthaug.physics import problem
 from orthaug.physics.projection import Projection
-from orthaug.studies.synthetic import mass_spring_damper
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -23,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("without_figures")
 @pytest.fixture
 def spec(tmp_path: Path) -> Path:
     """The demo's spec with its data, trained for a moment."""
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     for name, record in (("train", example.train), ("test", example.test)):
         run = record.experiments[0].rows(0, 1500)
         table = np.column_stack([run.inputs, run.outputs])

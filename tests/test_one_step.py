@@ -16,12 +16,12 @@ from orthaug import (
     OrthogonalPenalty,
     Record,
     Term,
+    synthetic,
 )
 from orthaug.fitting.one_step import OUTPUT_UNIT, OneStepTask
 from orthaug.models.learners import Scaling
 from orthaug.models.rows import from_chunks
 from orthaug.physics.problem import pose
-from orthaug.studies.synthetic import mass_spring_damper
 
 TERMS = [
     Term("a", "y1[k-1]", output="y1"),
@@ -123,7 +123,7 @@ def test_mean_square_is_that_of_the_projected_residual(task, run):
 
 
 def test_gram_has_no_rows_of_a_penalty():
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     task = OneStepTask.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
     w = task.bound.init(jax.random.key(0))
     free, held = (

@@ -18,8 +18,8 @@ from orthaug import (
     Orthogonal,
     OrthogonalPenalty,
     estimate,
+    synthetic,
 )
-from orthaug.studies.synthetic import mass_spring_damper
 
 PIPELINE = AdamLBFGS(
     adam_iterations=100, lbfgs_iterations=60
@@ -33,7 +33,7 @@ PENALTIES = (OrthogonalPenalty, BaselinePenalty)
 
 @lru_cache
 def example():
-    return mass_spring_damper()
+    return synthetic.mass_spring_damper()
 
 
 @lru_cache

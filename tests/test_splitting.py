@@ -29,9 +29,9 @@ from orthaug import (
     load,
     orthogonalize,
     save,
+    synthetic,
 )
 from orthaug.reports.result import MeasureResult
-from orthaug.studies.synthetic import static
 
 QUICK = LevenbergMarquardt()
 WIDE = Uniform({"u[k]": (-0.6, 0.6)})
@@ -77,7 +77,7 @@ def two():
 @pytest.fixture(scope="module")
 def curve():
     """The paper's static set 1 with 30 dB noise, briefly trained."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(example.train, example.baseline, learner=NET, solver=QUICK, regularization=1e-4)
 
 
@@ -200,7 +200,7 @@ def test_under_the_training_measure_nothing_changes(fit):
 
 
 def test_an_additive_fit_splits_to_least_squares():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     additive = estimate(
         example.train, example.baseline, learner=NET, solver=QUICK, structure=Additive()
     )
@@ -242,7 +242,7 @@ def test_a_measure_beyond_the_data_is_warned_of(curve, coarser):
 @pytest.mark.parametrize("data_set", [2, 3])
 def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
     """θ̂ errs by 0.0796 and 0.1433 under the training measure, however good the fit (F3)."""
-    example = static(data_set)
+    example = synthetic.static(data_set)
     for seed in range(2):
         fit = estimate(example.train, example.baseline, seed=seed, regularization="none", blocks=0)
         biased = {2: 0.0795547, 3: 0.1433322}[data_set]
@@ -251,7 +251,7 @@ def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
 
 
 def test_estimate_under_a_measure_is_the_split(coarser):
-    example = static(3, noise=True)
+    example = synthetic.static(3, noise=True)
     given = {"learner": NET, "solver": QUICK}
     direct = estimate(example.train, example.baseline, structure=Orthogonal(measure=WIDE), **given)
     split = estimate(example.train, example.baseline, **given).split(WIDE)
@@ -282,7 +282,7 @@ def test_a_model_trained_on_its_free_run():
 
 
 def test_an_ensemble_has_no_standard_errors_and_says_so(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     given = {"learner": NET, "solver": QUICK, "restarts": 3, "ensemble": True}
     fit = estimate(example.train, example.baseline, **given)
     found = fit.split(WIDE)
@@ -296,7 +296,7 @@ def test_an_ensemble_has_no_standard_errors_and_says_so(coarser):
 
 
 def test_physics_alone_keeps_theta_under_any_measure(coarser):
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, learner=None)
     found = fit.split(WIDE)
     np.testing.assert_allclose(found.theta, fit.theta, rtol=1e-13)
@@ -306,7 +306,7 @@ def test_physics_alone_keeps_theta_under_any_measure(coarser):
 
 
 def test_a_model_of_another_toolbox(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     fit = orthogonalize(
         example.train, example.baseline, lambda x: 0.01 + x - 0.5 * x**2 + 0.1 * x**3
     )
@@ -338,7 +338,7 @@ def test_a_learner_that_reads_other_lags_than_the_physics():
 
 
 def test_bounds_hold_under_the_training_measure_only(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     bounded = Baseline.from_terms([Term("theta1", "u[k]", max=0.9), Term("theta3", "u[k]**3")])
     with pytest.raises(
         InputError,

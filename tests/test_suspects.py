@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug import Baseline, InputError, Record, Suspect, Term
+from orthaug import Baseline, InputError, Record, Suspect, Term, synthetic
 from orthaug.analysis.suspects import KINDS, data_width, suspect_columns, usual_suspects
 from orthaug.data.expressions import Lag, parse
 from orthaug.physics.problem import pose
-from orthaug.studies.synthetic import MassSpringDamper
 
 LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
 X = np.random.default_rng(1).normal(size=(50, 3)) * [0.005, 0.005, 100.0]
@@ -59,7 +58,7 @@ def test_offset():
 
 
 def test_the_papers_friction_is_coulomb_and_stribeck():
-    system = MassSpringDamper()
+    system = synthetic.MassSpringDamper()
     coulomb = Suspect.of("coulomb", VELOCITY, constants=TS).values(X, LAYOUT, ["y"])[:, 0]
     stribeck = Suspect.of("stribeck", VELOCITY, width=system.stribeck, constants=TS).values(
         X, LAYOUT, ["y"]

@@ -26,6 +26,7 @@ from orthaug import (
     estimate,
     orthogonalize,
     prediction_std,
+    synthetic,
 )
 from orthaug.analysis.robustness import robust_where_asked
 from orthaug.inference.covariance import (
@@ -34,7 +35,6 @@ from orthaug.inference.covariance import (
     newey_west,
     robust_split_covariance,
 )
-from orthaug.studies.synthetic import NOISE_30_DB, static
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)
@@ -42,7 +42,7 @@ WIDE = Samples(
     {"u[k]": 0.6 * NODE}, weights=SHARE
 )  # uniform on ±0.6, exact for smooth physics, and quick
 QUICK = LevenbergMarquardt(iterations=12)
-EXAMPLE = static(1)
+EXAMPLE = synthetic.static(1)
 
 
 def powers(weights, z):
@@ -124,14 +124,14 @@ def clean():
 @pytest.fixture(scope="module")
 def noisy():
     """The paper's draw of 30 dB."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(example.train, example.baseline, learner=MLP((6,)), regularization=RIDGE)
 
 
 @cache
 def estimable():
     """The same draw with a learner of which the data determine every weight."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(
         example.train, example.baseline, learner=LINEAR, solver=QUICK, regularization="none"
     )
@@ -146,7 +146,8 @@ def draws(count, seed=0):
     (quiet,) = EXAMPLE.train.experiments
     for _ in range(count):
         yield Record.from_arrays(
-            quiet.inputs, quiet.outputs + rng.normal(scale=NOISE_30_DB, size=quiet.outputs.shape)
+            quiet.inputs,
+            quiet.outputs + rng.normal(scale=synthetic.NOISE_30_DB, size=quiet.outputs.shape),
         )
 
 
@@ -357,7 +358,7 @@ def test_one_pass_over_chunks_is_a_sum_over_rows(count):
 
 
 def test_physics_alone_has_its_textbook_as_joint_covariance():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, learner=None)
     np.testing.assert_allclose(fit.joint_covariance(), fit.covariance, rtol=1e-10)
     factor = 2 * (1024 - 2) / 1024
@@ -369,7 +370,7 @@ def test_what_has_no_joint_covariance(noisy):
         InputError, match="`convention` must be one of calibrated, paper; got 'ljung'"
     ):
         noisy.joint_covariance("ljung")
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     ensemble = estimate(
         example.train,
         example.baseline,
@@ -401,7 +402,7 @@ def test_prediction_std_is_the_delta_method(noisy):
 
 def test_prediction_std_of_an_unregularised_fit_is_that_of_what_the_data_see():
     """Over-parametrised weights: on its own rows a fit of rank r has variance rσ²/N on average."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, regularization="none")
     (found,) = prediction_std(fit.model, example.train)
     rank = np.mean(found**2) * len(found) / fit.model.statistics.noise[0, 0]
@@ -448,7 +449,7 @@ def test_prediction_intervals_cover_the_truth():
     test = Record.from_arrays(held_out, truth[1])
     inside, start = [], None
     for _ in range(100):
-        record = Record.from_arrays(u, truth[0] + rng.normal(scale=NOISE_30_DB, size=300))
+        record = Record.from_arrays(u, truth[0] + rng.normal(scale=synthetic.NOISE_30_DB, size=300))
         options = {"learner": LINEAR} if start is None else {"initial": start}
         fit = estimate(record, EXAMPLE.baseline, solver=LevenbergMarquardt(8), **options)
         start = start or fit
@@ -604,7 +605,7 @@ def test_newey_west_of_no_lag_is_whites():
 
 @cache
 def other(kind):
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     given = {"learner": MLP((6,)), "solver": QUICK}
     if kind == "bound":
         bounded = Baseline.from_terms([Term("theta1", "u[k]", max=0.9), Term("theta3", "u[k]**3")])
