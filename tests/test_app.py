@@ -31,7 +31,6 @@ from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
-from orthaug.commands.kinds import open_job
 from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -302,7 +301,7 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
         '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\ninitial = 0.5\n'
         "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
     )
-    job = open_job(tmp_path / "spec.toml")
+    job = load_spec(tmp_path / "spec.toml")
     runs = job.planned(AS_DECLARED)
     assert [tuple(run.values()) for run in runs] == [
         *(

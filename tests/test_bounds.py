@@ -26,10 +26,10 @@ from orthaug import (
     Simulation,
     Term,
     estimate,
+    load_spec,
     prediction_std,
 )
 from orthaug.analysis.imitation import imitation
-from orthaug.commands.spec import load_spec
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -535,7 +535,7 @@ def project(folder, spec=SPEC):
 
 
 def test_a_spec_carries_bounds(tmp_path):
-    baseline = load_spec(project(tmp_path)).declared_baseline()
+    baseline = load_spec(project(tmp_path)).problem.baseline
     np.testing.assert_array_equal(baseline.bounds, [[0.0, -np.inf, 0.1], [0.8, np.inf, np.inf]])
 
 

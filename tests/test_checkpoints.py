@@ -20,7 +20,6 @@ from orthaug._base.folders import PARTIALS
 from orthaug._base.progress import Progress
 from orthaug.commands.cli import app
 from orthaug.commands.fit import fit_job, keep_states, write_result
-from orthaug.commands.kinds import open_job
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.estimation import fit
 from orthaug.models.rows import InMemory
@@ -237,7 +236,7 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
     out = tmp_path / "out"
     with pytest.raises(Killed):
-        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(oa.load_spec(path), out), Progress(dies_at(5)))
     assert (tmp_path / "out.training" / "training.json").exists()
     assert tmp_path / "out.training" in PARTIALS.placed, "Ctrl-C names it"
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
@@ -246,10 +245,10 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     model = oa.load(out / "model")
     assert [p["value"] for p in expected["parameters"]] == list(model.theta)
     with pytest.raises(Killed):
-        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(oa.load_spec(path), out), Progress(dies_at(5)))
     path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
     run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
     assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)
-    fitted_again = fit_job(keep_states(open_job(path), out))
+    fitted_again = fit_job(keep_states(oa.load_spec(path), out))
     write_result(fitted_again, out, force=True)
     assert not (tmp_path / "out.training").exists()

@@ -19,7 +19,6 @@ from test_cli import make_project
 
 import orthaug
 from orthaug.commands.cli import app
-from orthaug.commands.spec import load_spec
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound
 
@@ -215,7 +214,7 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
         re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE)
     )
     with LEARNERS.added("polynomial", polynomial):
-        assert load_spec(spec).declared_learner() == polynomial(highest=2)
+        assert orthaug.load_spec(spec).spec.declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
     with pytest.raises(
         orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"

@@ -11,7 +11,6 @@ from test_cli import one_line, run, write_csv
 
 import orthaug as oa
 from orthaug import InputError, Output, State
-from orthaug.commands.spec import load_spec
 from orthaug.data.expressions import parse_named
 from orthaug.selection.explaining import _written, candidates_of
 from orthaug.selection.explanation import NewTerm, added_to_motion
@@ -281,7 +280,12 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
     assert done.code == 0 and told["found"] and told["terms"][0]["expression"] == "y[k-1]**3"
     grown = project / "grown.toml"
     grown.write_text(SPEC + told["spec"] + "\n" + ALONE, encoding="utf-8")
-    assert [term.parameter for term in load_spec(grown).baseline.terms] == ["a", "b", "g", "cubic"]
+    assert [term.parameter for term in oa.load_spec(grown).spec.baseline.terms] == [
+        "a",
+        "b",
+        "g",
+        "cubic",
+    ]
     page = run("explain", project / "plant", project / "run.csv").out
     assert (
         page.startswith("y[k-1]**3 explains 9")
@@ -320,7 +324,7 @@ def test_where_the_spec_has_a_map_to_physical_parameters_the_lines_for_it_are_to
     (project / "mapped.toml").write_text(
         SPEC + term + "\n" + own + 'cubic = "cubic"\n' + ALONE, encoding="utf-8"
     )
-    assert load_spec(project / "mapped.toml").baseline.terms[3].parameter == "cubic"
+    assert oa.load_spec(project / "mapped.toml").spec.baseline.terms[3].parameter == "cubic"
 
 
 @pytest.mark.parametrize(

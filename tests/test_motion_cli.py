@@ -22,7 +22,6 @@ import orthaug as oa
 from orthaug import InputError, read_record
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.commands import cli
-from orthaug.commands.kinds import open_job
 from orthaug.models.motion_field import parts_at
 
 SPEC = """
@@ -865,7 +864,7 @@ def test_bad_input_is_one_worded_line(folder, old, new, words):
     spec = folder / "bad.toml"
     spec.write_text(SPEC.replace(old, new, 1))
     with pytest.raises(InputError) as refused:
-        open_job(spec)
+        oa.load_spec(spec)
     message = str(refused.value)
     assert words in message and message.startswith(str(spec)) and "\n" not in message
 
@@ -886,13 +885,13 @@ def test_what_a_motion_is_trained_with_unless_asked(folder):
     spec.write_text(
         SPEC.replace("segment = 150\n", "").replace('[learner]\nhidden = [3]\ninputs = ["v"]\n', "")
     )
-    criterion = open_job(spec).spec.declared_criterion()
-    assert (criterion, open_job(spec).spec.declared_learner()) == (
+    criterion = oa.load_spec(spec).spec.declared_criterion()
+    assert (criterion, oa.load_spec(spec).spec.declared_learner()) == (
         oa.Simulation("auto", 0),
         oa.MLP(),
     )
     spec.write_text(spec.read_text().replace(", learned = true", ""))
-    job = open_job(spec)
+    job = oa.load_spec(spec)
     assert job.spec.declared_learner() is None and job.compared == ("physics alone",)
 
 
@@ -906,7 +905,7 @@ def test_rows_of_a_motion_are_all_usable(folder):
     spec.write_text(
         SPEC.replace("run.csv", "gaps.csv").replace("[data]\n", '[data]\nmissing = "skip"\n')
     )
-    job = open_job(spec)
+    job = oa.load_spec(spec)
     assert [len(e) for e in job.train.record.experiments] == [
         49,
         67,
@@ -922,13 +921,13 @@ def test_rows_of_a_motion_are_all_usable(folder):
         InputError,
         match=r"short.csv: data.tests.steps has 2 rows, too few; at least 3 determine where",
     ):
-        open_job(spec)
+        oa.load_spec(spec)
 
 
 def test_opening_a_motion_loads_no_jax(folder):
     program = (
-        "import sys\nfrom pathlib import Path\nfrom orthaug.commands.kinds import open_job\n"
-        f"open_job(Path({str(put(folder))!r}))\nassert 'jax' not in sys.modules\n"
+        "import sys\nimport orthaug as oa\n"
+        f"oa.load_spec({str(put(folder))!r})\nassert 'jax' not in sys.modules\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False

@@ -22,11 +22,11 @@ from orthaug import (
     Simulation,
     Training,
     load,
+    load_spec,
     read_record,
 )
 from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
-from orthaug.commands.spec import load_spec
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
 from orthaug.fitting.structures import PenaltyRows
 from orthaug.inference.kinds import MEASURES
@@ -105,7 +105,9 @@ def test_a_learner_from_outside(project, tmp_path):
     )
     assert run("fit", spec).code == 2
     with LEARNERS.added("powers", Powers):
-        assert load_spec(spec).declared_learner() == Powers(2, (1.0, 2.5), ("u[k-1]", "y[k-1]"))
+        assert load_spec(spec).spec.declared_learner() == Powers(
+            2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
+        )
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         model = load(tmp_path / "out")
@@ -151,7 +153,7 @@ def test_a_structure_from_outside(project, tmp_path):
         project, "nearness", '[structure]\nkind = "nearness"\nstiffness = 1e9\n' + TRAINED
     )
     with STRUCTURES.added("nearness", Nearness):
-        assert load_spec(spec).declared_structure() == Nearness(1e9)
+        assert load_spec(spec).spec.declared_structure() == Nearness(1e9)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         result = finite_json(done.out)
