@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from test_cli import run, signals, write_csv
 
-from orthaug import InputError
+from orthaug import InputError, load_spec
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Run, WorkerPool
@@ -31,11 +31,12 @@ from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thinned
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
-from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
 HAS_PAGE = importlib.util.find_spec("nicegui") is not None
+if HAS_PAGE:
+    from orthaug.commands.app import routes
 HAS_BROWSER = importlib.util.find_spec("playwright") is not None and CHROMIUM is not None
 served = pytest.mark.skipif(not HAS_PAGE or os.name != "posix", reason="no NiceGUI, or no SIGINT")
 browsed = pytest.mark.skipif(
@@ -45,8 +46,8 @@ browsed = pytest.mark.skipif(
 MAIN = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may have inherited none
-from orthaug.commands.entry import main
-main()
+import runpy
+runpy.run_module("orthaug", run_name="__main__")
 """
 LATE = 90_000  # ms
 SPEC = """# kept
@@ -184,19 +185,27 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     assert "unit" not in spec_text.as_motion(SPEC)
 
 
+def trained_on(folder: Path, pattern: str) -> list[str]:
+    """The files, from the folder of the spec, that a spec with this in the place of a file reads."""
+    spec = folder / "spec.toml"
+    spec.write_text(SPEC[: SPEC.index("tests.one")].replace('"run.csv", "/there/b.csv"', f'"{pattern}"')
+                    + SPEC[SPEC.index("[[baseline") :])  # fmt: skip
+    return [file.path for file in load_spec(spec).train.files]
+
+
 def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
-    (tmp_path / "run [1].csv").touch()
-    assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
+    write_csv(tmp_path / "run [1].csv", **dict(zip("uy", signals(20, 1), strict=True)))
+    assert trained_on(tmp_path, "run [1].csv") == ["run [1].csv"]
 
 
 def test_a_text_beside_tables_is_a_note(tmp_path):
-    for name in ("a.csv", "b.csv", "notes.txt", "c.dat", "plot.png"):
-        (tmp_path / name).touch()
+    columns = dict(zip("uy", signals(20, 1), strict=True))
     (tmp_path / "plain").mkdir()
-    for name in ("a.txt", "b.dat"):
-        (tmp_path / "plain" / name).touch()
-    assert expanded(tmp_path / "spec.toml", ["."], "train") == ["./a.csv", "./b.csv"]
-    assert expanded(tmp_path / "spec.toml", ["plain"], "train") == ["plain/a.txt", "plain/b.dat"]
+    for name in ("a.csv", "b.csv", "notes.txt", "c.dat", "plain/a.txt", "plain/b.dat"):
+        write_csv(tmp_path / name, **columns)
+    (tmp_path / "plot.png").touch()
+    assert trained_on(tmp_path, ".") == ["./a.csv", "./b.csv"]
+    assert trained_on(tmp_path, "plain") == ["plain/a.txt", "plain/b.dat"]
 
 
 def test_a_curve_is_thinned_to_what_is_seen():
@@ -241,11 +250,9 @@ def test_each_dropped_file_keeps_its_content(tmp_path):
     assert (tmp_path / "run.csv").read_text() == "first"
 
 
+@served
 def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatch):
     from starlette.requests import Request
-
-    from orthaug.commands.app import routes
-    from orthaug.commands.app.session import Sessions
 
     monkeypatch.setattr(routes, "LARGEST", 10)
     sessions = Sessions(tmp_path)
@@ -377,10 +384,8 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
 
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
-    from orthaug.commands.app.routes import Page
-
     session = Session("key", tmp_path, WorkerPool())
-    page, told, seen = Page(session), [], []
+    page, told, seen = routes.Page(session), [], []
     monkeypatch.setattr(page, "_complain", told.append)
     monkeypatch.setattr(page, "_name", lambda: None)
     monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)

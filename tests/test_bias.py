@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug import InputError, RankError, Record, Suspect, synthetic
+from orthaug import InputError, RankError, Record, Suspect, estimate, synthetic
 from orthaug.analysis.bias import Certificate, bias_table, find_certificate
 from orthaug.analysis.suspects import data_width, suspect_columns
-from orthaug.physics.problem import pose
 from orthaug.physics.projection import Projection
 
 TS = {"Ts": 0.01}
@@ -31,9 +30,9 @@ ANY = Suspect("any", "1")
 
 @pytest.fixture(scope="module")
 def machine():
-    """The posed problem of the paper's record."""
+    """The problem of the paper's record."""
     example = synthetic.mass_spring_damper()
-    return pose(example.train, example.baseline)
+    return estimate(example.train, example.baseline, learner=None).problem
 
 
 def table(problem, suspects, **more) -> Any:
@@ -68,7 +67,7 @@ def simulated(noise=None, friction=True):
         inputs=["force"],
         outputs=["position"],
     )
-    return pose(record, example.baseline)
+    return estimate(record, example.baseline, learner=None).problem
 
 
 def paper_noise():
@@ -102,7 +101,7 @@ def test_friction_and_noise_explain_the_whole_error(machine):
 
 def test_the_error_of_the_papers_data_set_3_is_predicted():
     example = synthetic.static(3)
-    problem = pose(example.train, example.baseline)
+    problem = estimate(example.train, example.baseline, learner=None).problem
     (found,) = table(problem, [Suspect("rest", "0.01 - 0.5*u[k]**2", coefficient=1.0)])
     assert np.linalg.norm(found.expected) == pytest.approx(0.1433, abs=1e-4)
     np.testing.assert_allclose(
@@ -112,7 +111,7 @@ def test_the_error_of_the_papers_data_set_3_is_predicted():
 
 def test_an_even_term_biases_nothing_under_a_symmetric_measure():
     example = synthetic.static(1)
-    problem = pose(example.train, example.baseline)
+    problem = estimate(example.train, example.baseline, learner=None).problem
     (found,) = table(problem, [Suspect("square", "u[k]**2")])
     assert np.abs(found.bias).max() < 1e-14 and found.cosine < 1e-14
     assert found.certificate == Certificate("removable")

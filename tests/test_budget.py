@@ -28,11 +28,8 @@ from orthaug import (
     synthetic,
 )
 from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
-from orthaug.analysis.measure_bias import MeasureLinearization
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.suspects import usual_suspects
-from orthaug.inference.measures import weigh_problem
-from orthaug.physics.problem import pose
 
 LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "u[k-1]")])
 THETA, SIZE, VELOCITY = np.array([1.2, -0.5, 0.3]), 0.02, "y[k-1]-y[k-2]"
@@ -83,16 +80,16 @@ def test_what_nothing_is_shared_with_is_removed_by_the_learner():
         (Suspect("even", f"({VELOCITY})**2"),), certify=True
     )
     assert even.seen and even.removed_by == "learner and measure"
-    problem = pose(
-        fit.problem.record, Baseline.from_terms([Term("c", "u[k-1]")]), Lags(1, 1, 1), ("y[k-1]",)
+    other = estimate(
+        fit.problem.record,
+        Baseline.from_terms([Term("c", "u[k-1]")]),
+        lags=Lags(1, 1, 1),
+        learner=MLP((2,), inputs=("y[k-1]",)),
+        solver=LevenbergMarquardt(2),
     )
-    ground = MeasureLinearization(
-        weigh_problem(Training(), problem),
-        problem,
-        problem.least_squares,
-        directions=problem.shared.basis,
+    (drag,) = linearization_of(other, Training()).table(
+        (Suspect("drag", "y[k-1]*abs(y[k-1])"),), certify=True
     )
-    (drag,) = ground.table((Suspect("drag", "y[k-1]*abs(y[k-1])"),), certify=True)
     assert drag.removed_by == "learner" and drag.bias == (0.0,)
 
 

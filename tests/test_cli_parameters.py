@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
 from orthaug import load, load_spec, synthetic
-from orthaug.inference.covariance import interval
 
 TRUE = {"m": 1.0, "cd": 100.0, "ks": 1000.0}
 SYSTEM = synthetic.MassSpringDamper()
@@ -121,7 +121,7 @@ def test_physical_parameters_with_intervals(plain):
     for row in rows:
         assert row["value"] == pytest.approx(TRUE[row["name"]], abs=4 * row["std"])
         assert 0 < row["std"] < 1e-2 * row["value"]
-        expected = interval(np.array([row["value"]]), np.array([row["std"]]), 1498 - 3)[0]
+        expected = scipy.stats.t(1498 - 3, row["value"], row["std"]).interval(0.95)
         np.testing.assert_allclose(row["ci95"], expected, rtol=1e-9)
     assert result["physical_consistency"] is None and result["warnings"] == []
 

@@ -29,7 +29,6 @@ from orthaug import (
     estimate,
     orthogonalize,
 )
-from orthaug.fitting.status import Ending
 
 REGRESSORS = {
     1: ("y[k-1]", "u[k]", "u[k-1]", "1", "y[k-1]**3", "sin(2*u[k])", "y[k-1]*u[k-1]", "abs(u[k])"),
@@ -227,9 +226,7 @@ def test_every_combination(structure, regularization, ny, learner):
         )
         for _ in range(2)
     )
-    codes = {ending.code for ending in Ending}
-    assert first.status.code in codes
-    assert codes == {"converged", "iteration_limit", "no_descent", "non_finite", "exact", "stopped"}
+    assert first.status.code in ("converged", "iteration_limit", "no_descent", "exact")
     assert (first.status.code == "exact") == (learner == "none")
     assert np.isfinite(first.status.loss) and 0 <= first.status.loss < 1
     assert np.isfinite(first.theta).all() and np.isfinite(first.model.numbers.weights).all()

@@ -15,10 +15,9 @@ from pathlib import Path
 import pytest
 from sources import parsed
 from test_architecture import ROOMS
-from test_cli import make_project
+from test_cli import make_project, run
 
 import orthaug
-from orthaug.commands.cli import app
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound
 
@@ -100,9 +99,7 @@ def commands_in(text: str) -> set[str]:
     }
 
 
-COMMANDS = {
-    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
-}
+COMMANDS = {*re.findall(r"^  (\w+) ", run("--help").out.partition("Commands:")[2], re.MULTILINE)}
 
 
 @cache

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from orthaug import Baseline, InputError, RankError, Record, Term, identifiability
-from orthaug.data.expressions import Lag
 from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.problem import pose
 from orthaug.physics.projection import Projection
@@ -89,7 +88,7 @@ def test_more_columns_than_rows():
         require_rank(found, 2)
 
 
-LAYOUT = (Lag("y", 1), Lag("u", 0))
+LAYOUT = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]")]).lags
 
 
 def test_identifiable_but_not_excited():

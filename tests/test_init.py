@@ -15,6 +15,7 @@ import scipy.signal
 from helpers import unfolded
 from test_cli import run
 
+from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen

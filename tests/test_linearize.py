@@ -20,7 +20,6 @@ from orthaug.analysis.linear_system import System, converted, modes_of, observer
 from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag
 from orthaug.models.stepping import Memory
-from orthaug.reports.linear import LinearizeResult
 from orthaug.reports.linear_text import linear_text
 
 STEP = 0.05
@@ -418,7 +417,7 @@ def test_the_command_writes_numbers_a_page_and_figures(cubic, tmp_path, monkeypa
         and "written to linear" in done.out
     )
     told = json.loads((tmp_path / "linear/result.json").read_text())
-    assert LinearizeResult.model_validate(told).points[0].outputs["y"] == pytest.approx(0.5)
+    assert told["points"][0]["outputs"]["y"] == pytest.approx(0.5)
     assert told["held"] == "found" and len(told["points"][0]["frequency"]) == 400
     assert (tmp_path / "linear/linear.txt").read_text().strip() in done.out
     for name in ("bode", "poles"):

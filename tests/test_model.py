@@ -19,7 +19,6 @@ from orthaug import (
     Term,
     estimate,
 )
-from orthaug.reports.result import ScoreResult
 
 FEW = LevenbergMarquardt(iterations=5)
 NETWORK = MLP(hidden=(3,))
@@ -299,11 +298,7 @@ def test_divergence_is_named(factors, diverging):
     ):
         assert np.isnan(part[29:]).all()
     scores = model.simulate(Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])).scores()
-    assert ScoreResult.model_validate(scores).content() == {
-        "rmse": None,
-        "nrmse": None,
-        "fit": None,
-    }
+    assert np.isnan([scores.rmse, scores.nrmse, scores.fit]).all()
 
 
 def test_a_run_that_overflows():

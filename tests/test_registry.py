@@ -25,7 +25,6 @@ from orthaug import (
     load_spec,
     read_record,
 )
-from orthaug._base.errors import KeyedError
 from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
 from orthaug.fitting.structures import PenaltyRows
@@ -302,7 +301,7 @@ def test_keys_and_limits_of_a_declaration():
     assert list(keys_of(Whole)) == ["path", "count", "size", "shape"]
     registry = Registry("thing", {"whole": Whole})
     assert registry.declare("whole", {"path": "a", "count": 0, "unknown": 1}) == Whole("a", 0)
-    with pytest.raises(KeyedError, match="the thing 'whole' needs `path`"):
+    with pytest.raises(InputError, match="the thing 'whole' needs `path`"):
         registry.declare("whole", {})
     with pytest.raises(InputError, match="unknown thing 'whol', did you mean 'whole'?"):
         registry.declare("whol", {})

@@ -20,7 +20,6 @@ from test_motion_cli import put
 import orthaug as oa
 from orthaug import Channel, Response, Trajectory
 from orthaug.commands.compare import compare_report
-from orthaug.commands.fit import fit_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
 from orthaug.reports.findings import BiasResult
@@ -98,8 +97,8 @@ def compared(lagged):
 @pytest.fixture(scope="module")
 def pages(lagged, motion, compared):
     return {
-        "lagged": fit_report(lagged),
-        "motion": fit_report(motion),
+        "lagged": lagged.report().html,
+        "motion": motion.report().html,
         "compared": compare_report(compared),
     }
 
@@ -277,7 +276,7 @@ def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(l
         for row in lagged.result.parameters
     ]
     told = Read(
-        fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})))
+        replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})).report().html
     )
     assert "(mm/N)" in told.text("td") and any(
         "it follows from the units of the channels" in c for c in told.text("caption")
@@ -494,14 +493,14 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
     told = "train: findings and figures use 10 of 99 rows, in windows spread over them."
-    page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
+    page = Read(replace(lagged, result=with_warning(lagged, "witness", told)).report().html)
     (section,) = page.text("section", id="free-run")
     assert told in section
 
 
 def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
     told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
-    page = fit_report(replace(lagged, result=with_warning(lagged, "small_margin", told)))
+    page = replace(lagged, result=with_warning(lagged, "small_margin", told)).report().html
     assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
     whole = [
         "".join(text)

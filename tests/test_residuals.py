@@ -10,7 +10,6 @@ import scipy.stats
 from scipy.signal import lfilter
 
 from orthaug import InputError
-from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.whiteness import (
@@ -27,13 +26,6 @@ BETWEEN = (
     0.005,
     0.016,
 )  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
-
-
-@pytest.fixture(autouse=True)
-def small_products():
-    """Where other processes run, threads that wait for each other take ten times as long."""
-    with one_blas_thread():
-        yield
 
 
 def coloured(white, *a):

@@ -24,7 +24,6 @@ from orthaug import (
     estimate,
 )
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.status import Ending
 from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(3.0), BaselinePenalty(20.0))
@@ -171,7 +170,7 @@ def fit(structure, ny, shared, solver):
 @pytest.mark.parametrize(("structure", "ny", "shared"), CASES, ids=IDS)
 def test_every_solver_fits_every_structure(structure, ny, shared, solver):
     found, again = fit(structure, ny, shared, solver), fit(structure, ny, shared, solver)
-    assert found.status.code in {ending.code for ending in Ending} and found.status.ok
+    assert found.status.code in ("converged", "iteration_limit", "no_descent") and found.status.ok
     assert np.isfinite(found.theta).all() and np.isfinite(found.status.loss)
     np.testing.assert_array_equal(again.theta, found.theta)
     np.testing.assert_array_equal(again.model.numbers.weights, found.model.numbers.weights)
