@@ -19,10 +19,10 @@ from orthaug import (
     OrthogonalPenalty,
     Record,
     Term,
-    estimate,
     synthetic,
 )
 from orthaug.models.learners import Bound
+from orthaug.physics.problem import pose
 from orthaug.studies.common import trained
 from orthaug.studies.published import Data, initial_weights, loss
 
@@ -54,9 +54,7 @@ def test_the_criterion_is_the_formula(structure):
     u, unknowns = rng.normal(size=40), rng.normal(size=51)
     y = u - 0.5 * u**2
     terms = [Term("a", "u[k]", initial=INITIAL[0]), Term("b", "u[k]**3", initial=INITIAL[1])]
-    physics = Baseline.from_terms(terms)
-    problem = estimate(Record.from_arrays(u, y), physics, learner=None).problem
-    data = Data.of(problem, structure)
+    data = Data.of(pose(Record.from_arrays(u, y), Baseline.from_terms(terms)), structure)
     slope = jax.jit(jax.value_and_grad(loss), static_argnums=(2, 3))
     value, gradient = slope(
         jnp.asarray(unknowns), data, Bound(MLP((16,)), 1, 1), structure.projects
