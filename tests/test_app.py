@@ -190,7 +190,7 @@ def trained_on(folder: Path, pattern: str) -> list[str]:
     spec = folder / "spec.toml"
     spec.write_text(SPEC[: SPEC.index("tests.one")].replace('"run.csv", "/there/b.csv"', f'"{pattern}"')
                     + SPEC[SPEC.index("[[baseline") :])  # fmt: skip
-    return [file.path for file in load_spec(spec).train.files]
+    return [file.file for file in load_spec(spec).train.files]
 
 
 def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
