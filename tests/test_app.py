@@ -1137,7 +1137,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
     gone = tab.context.request.get(f"{server.base}session/absent")
-    assert gone.status == 404 and "this session has ended" in gone.text()
+    assert gone.status == 404 and "This session has ended" in gone.text()
     tab.close()
 
 
