@@ -297,13 +297,16 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
 
 @contextmanager
 def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Iterator[Path]:
-    """A file beside `path` that takes its place at the end, and vanishes on any exception.
+    """Yield a file beside `path` that replaces it at the end, and vanishes on any exception.
 
     A link is followed: its target is written. What is no regular file, such as a pipe, is written
     into.
 
-    Args: force: replace whatever is there. result: whether a command that a signal ends names the
-        file among what it wrote; False for a cache.
+    Args:
+        path: the file to write.
+        force: replace whatever is there.
+        result: whether a command that a signal ends names the file among what it wrote; False for a
+            cache.
 
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.

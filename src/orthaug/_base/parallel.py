@@ -139,10 +139,11 @@ class Threads:
     ) -> Iterator[Result]:
         """Yield `function(given, item, report)` of every item in order.
 
-        Args: function: of a module, so that it can be sent elsewhere. It calls `report(…)` now and
-            then, which raises
-                `RunCancelled` once the results are not wanted.
+        Args:
+            function: of a module, so that it can be sent elsewhere. It calls `report(…)` now and
+                then, which raises `RunCancelled` once the results are not wanted.
             given: what all runs share.
+            items: one for each run.
             heard: called with the number of an item and the reports of its run.
         """
 

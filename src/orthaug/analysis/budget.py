@@ -318,7 +318,8 @@ def _candidates(
             Candidate(entry.suspect.name, explains(entry), _moved(entry) + bias - _moved(cause),
                       entry.suspect in suspects)
             for entry in others
-            if entry.explained and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
+            if entry.explained
+            and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
         ]  # fmt: skip
         kept += compatible(likely, noise_share(own, fit))
     return kept

@@ -59,10 +59,11 @@ class Change:
     def name(self) -> str:
         """The change, to go on from "with"."""
         where = f" of {self.output}" if self.output else ""
+        place = f"in the physics{where} (or the learner)"
         return {
             "criterion": f'focus = "{self.what}"',
-            "input_lag": f"the further input lag {self.what} in the physics{where} (or the learner)",
-            "output_lag": f"the further output lag {self.what} in the physics{where} (or the learner)",
+            "input_lag": f"the further input lag {self.what} {place}",
+            "output_lag": f"the further output lag {self.what} {place}",
             "offset": f"an offset in the physics{where}",
             "learner": self.what,
         }[self.kind]

@@ -73,7 +73,8 @@ def linearize(
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> round(linearize(oa.estimate(record, physics, learner=None))[0].poles[0].z.real, 6)
         0.5
@@ -214,10 +215,10 @@ def _view(
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     if isinstance(model, MotionModel):
         units |= {state.name: state.unit for state in model.form.motion.states}
-    return LinearView(
-        point, sampled, found, poles, sampled.modes.at_zero, gain, gain_ci95, bode, names, step.inputs,
-        tuple(channel.name for channel in model.outputs), units, freedom, tuple(warnings), smooth,
-    )  # fmt: skip
+    outputs = tuple(channel.name for channel in model.outputs)
+    modes = sampled.modes.at_zero
+    seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)
+    return LinearView(*seen, units, freedom, tuple(warnings), smooth)
 
 
 def _system(

@@ -298,10 +298,8 @@ def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
             and name not in fit.unidentified
             and abs(moved) > _LARGE_SHARE * abs(value)
         ):
-            shifts.append(
-                f"{name} by "
-                f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
-            )
+            per_cent = share.replace(",", " (", 1).replace("( ", "(") + (")" if share else "")
+            shifts.append(f"{name} by {moved:+.2g}{per_cent}")
     if not shifts:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"

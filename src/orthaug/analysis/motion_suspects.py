@@ -49,7 +49,8 @@ class MotionSuspect:
     may be left out where one state is learned, or only one equation has parameters.
 
     Examples:
-        >>> MotionSuspect.of("coulomb", "v", factor="-1/m", equation="v", coefficient=1.5, unit="N").expression
+        >>> force = {"factor": "-1/m", "equation": "v", "coefficient": 1.5, "unit": "N"}
+        >>> MotionSuspect.of("coulomb", "v", **force).expression
         '(-1/m)*(sign(v))'
     """
 

@@ -188,7 +188,8 @@ class ObserverState:
     Examples:
         >>> import numpy as np, orthaug as oa
         >>> u = np.sin(np.arange(200.0))
-        >>> y = np.convolve(u, 0.5 ** np.arange(20))[:200] + 0.01 * np.random.default_rng(0).normal(size=200)
+        >>> noise = 0.01 * np.random.default_rng(0).normal(size=200)
+        >>> y = np.convolve(u, 0.5 ** np.arange(20))[:200] + noise
         >>> record = oa.Record.from_arrays(u, y)
         >>> baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k]")])
         >>> now = oa.Observer(oa.estimate(record, baseline, learner=None)).start(record)

@@ -362,7 +362,8 @@ def verdict(
         >>> import numpy as np
         >>> import orthaug as oa
         >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
         >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
         >>> train, test = record.split(0.7)
         >>> fit = oa.estimate(train, gain, learner=oa.Terms(("u[k]**3",)))

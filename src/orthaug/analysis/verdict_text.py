@@ -260,9 +260,13 @@ def _quantised(seen: Finding) -> str:
     if not seen.steps:
         return ""
     units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
-    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, "
-        f"and the one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
-            for test in seen.tests if test.name in seen.steps}  # fmt: skip
+    each = {
+        test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}"
+        f"{units[test.name]}, and the one-step residual ({test.rms:.2g}{units[test.name]}) is no "
+        "larger"
+        for test in seen.tests
+        if test.name in seen.steps
+    }
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
         f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "

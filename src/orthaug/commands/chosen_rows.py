@@ -145,7 +145,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
 
 
 def after_choice(job: Any, fit: Any) -> tuple[Any, Intervals | None]:
-    """Return a fit and the source of its intervals; without these where its rows chose its terms."""
+    """Return a fit and the source of its intervals; without them if its rows chose its terms."""
     found = intervals_of(job, fit) if fit.status.ok else None
     if found is None or found.source != "none":
         return fit, found

@@ -215,7 +215,7 @@ class MotionSection(Section):
 
     @property
     def learns(self) -> bool:
-        """Whether a learner is added to any equation or output."""
+        """True if a learner is added to any equation or output."""
         outputs = (
             output.learned for output in self.outputs.values() if not isinstance(output, str)
         )

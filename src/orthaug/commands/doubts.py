@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 _LISTED = 3  # parameters, and terms with memory
 _DETERMINED = re.compile(
-    r"( The fit determines | Of the physical parameters it determines )[^.]*\.|: the fit determines [^.]*"
+    r"( The fit determines | Of the physical parameters it determines )[^.]*\."
+    r"|: the fit determines [^.]*"
 )
 
 

@@ -50,7 +50,7 @@ class Variant:
 
     @property
     def alone(self) -> bool:
-        """Whether the variant has no learner."""
+        """True if the variant has no learner."""
         return self.kind == PHYSICS_ONLY
 
     @property
@@ -154,7 +154,7 @@ class Job(ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the physics is linear in θ."""
+        """True if the physics is linear in θ."""
         return False
 
     def planned(self, variant: Variant) -> Plan:

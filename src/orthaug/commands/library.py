@@ -140,7 +140,10 @@ class Page:
     def _repr_html_(self) -> str:
         style = f"width:100%;height:{_HEIGHT}px;border:1px solid rgba(128,128,128,.35)"
         inside = escape(self.html, quote=True)
-        return f'<iframe title="report of the fit" sandbox="allow-scripts" style="{style}" srcdoc="{inside}"></iframe>'
+        return (
+            f'<iframe title="report of the fit" sandbox="allow-scripts" style="{style}" '
+            f'srcdoc="{inside}"></iframe>'
+        )
 
 
 @dataclass(frozen=True)

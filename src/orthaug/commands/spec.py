@@ -388,7 +388,7 @@ class Spec(Section):
 
     @property
     def brought(self) -> bool:
-        """Whether training reads all rows into memory."""
+        """True if training reads all rows into memory."""
         free_run = self.declared_criterion().free_run
         return self.motion is not None or (free_run is not None and not free_run.steps)
 
@@ -412,7 +412,7 @@ class Spec(Section):
         )
 
     def runs(self, *, linear: bool) -> int:
-        """Number of runs in a fit: restarts times regularizations."""
+        """Return the number of runs in a fit: restarts times regularizations."""
         validated = self.data.validation is not None
         return self.training.restarts * len(
             self.regularizations(linear=linear, validated=validated)

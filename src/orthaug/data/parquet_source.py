@@ -203,13 +203,17 @@ def open_parquet(
 
     Rows, columns and their types, experiments and the sampling time are read.
 
-    Args: paths: of the files, in order; none of them reaches into the next. inputs, outputs:
-        channel names, or `Channel`s with column, unit, scale and offset. sampling_time: seconds
-        between rows; or `time`, the column that holds the instants. experiment: a column of whole
-        numbers that labels the experiments within a file; None for one a file. columns: the files'
-        column for a channel, `{"position": "yVal"}`. missing: "error", or "skip" to end a stretch
-        at rows with a missing sample. partition_rows: rows of a partition at least; row groups are
-        never cut.
+    Args:
+        paths: the files, in order; none of them reaches into the next.
+        inputs: channel names, or `Channel`s with column, unit, scale and offset.
+        outputs: as `inputs`.
+        sampling_time: seconds between rows.
+        time: the column that holds the instants, instead of `sampling_time`.
+        experiment: a column of whole numbers that labels the experiments within a file; None for
+            one a file.
+        columns: the files' column for a channel, `{"position": "yVal"}`.
+        missing: "error", or "skip" to end a stretch at rows with a missing sample.
+        partition_rows: rows of a partition at least; row groups are never cut.
 
     Raises:
         InputError: a file that cannot be read, has no rows, lacks a column or holds another type in

@@ -62,11 +62,14 @@ def read_record(
 ) -> Record:
     r"""Read one file; several row ranges are experiments of their own.
 
-    Args: path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
-        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
-        sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers
-        in the unit of its
-            header (`t [ms]`; s without one), or dates, which count from the first row of the file.
+    Args:
+        path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
+        inputs: channel names, or `Channel`s with column, unit, scale and offset.
+        outputs: as `inputs`.
+        sampling_time: seconds between rows.
+        time: the column that holds the instants, instead of `sampling_time`: numbers in the unit of
+            its header (`t [ms]`; s without one), or dates, which count from the first row of the
+            file.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
         every: keep each n-th row (no filter); the sampling time is multiplied, so it is that of the
             file's rows.

@@ -152,8 +152,9 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     Args:
         model: as `estimate` or `load` gives it.
 
-    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` list
-        what is in both.
+    Returns:
+        The step: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs`
+        list the entries of both.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a spline hold.

@@ -22,8 +22,9 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 
     What was held together once before is not released again, so that this ends.
 
-    Args: fixed: what is held first. run: runs with some entries held, and gives those that are at
-        one then; None to leave it at that.
+    Args:
+        fixed: the entries fixed first.
+        run: runs with some entries fixed, and returns those that are at a bound then; None to end.
     """
     tried = [fixed]
     while (active := run(fixed)) is not None:

@@ -258,7 +258,7 @@ class Estimate(AnyFit):
         )
 
     def withheld(self, kind: str, why: Warning) -> Estimate:
-        """The same without standard errors and intervals, of θ, of terms and of predictions.
+        """Return the fit without standard errors and intervals of θ, terms and predictions.
 
         A warning says why.
         """

@@ -55,8 +55,9 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         first: a fit with any output weights.
         again: the fit of a problem with other weights, begun from an earlier estimate.
 
-    Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
-        the errors' covariance is singular; a warning says that the turns did not settle.
+    Returns:
+        The last fit, with the restarts of the first one. It keeps its weights where the errors'
+        covariance is singular; a warning says that the turns did not settle.
     """
     estimate, problem = first, first.problem
     covariance = problem.target_covariance

@@ -199,9 +199,14 @@ def check_cost(
 ) -> None:
     """Raise InputError for normal equations beyond memory, or more than a month of training.
 
-    Args: learner: None for physics alone, which costs nothing; one that does not know its `weights`
-        is let pass. rows: usable ones. features, outputs: of the learner. iterations: of a run at
-        most. runs: restarts times regularizations. held: rows that are in memory; None for all.
+    Args:
+        learner: None for physics alone, which costs nothing; one without `weights` is accepted.
+        rows: usable rows.
+        features: of the learner.
+        outputs: of the learner.
+        iterations: of a run at most.
+        runs: restarts times regularizations.
+        held: rows that are in memory; None for all.
         room: of the workers or devices that add up; None where that is this process.
     """
     held = rows if held is None else held

@@ -254,8 +254,10 @@ def baseline_of(
 ) -> Baseline:
     """Return the physics of an estimator's argument.
 
-    Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
-        Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
+    Args:
+        physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
+            Baseline, or a JAX function.
+        layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
         names: columns that expressions may use without an instant.
 

@@ -79,9 +79,11 @@ def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()
 
     For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
-    Args: middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
-        fixed: entries at a bound. They have NaN; the others' covariance holds with them
-        fixed there.
+    Args:
+        factor: of Φ.
+        middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
+        fixed: entries at a bound. They have NaN; the others' covariance holds with them fixed
+            there.
     """
     nt = len(factor.scale)
     free = [i for i in range(nt) if i not in fixed]
@@ -134,15 +136,19 @@ def interval(
 def joint_covariance(
     problem: Problem, model: Model, convention: str = "calibrated", *, own_units: bool = False
 ) -> Matrix:
-    """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
+    """Return Cov (nθ + nw)² of θ̂ and the learner's weights in the orthogonal structure.
 
+    It is formed from the raw `[Φ J̃]`, J̃ = P⊥J.
     Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all
     outputs have the same noise or share no θ. One pass over the rows.
 
-    Args: convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
-        included. own_units: invert the weights' block by a pseudo-inverse in the weights' own
-        units: of directions whose
-            eigenvalue is rounding beside the largest, there is nothing in the result.
+    Args:
+        problem: rows and physics.
+        model: the fitted model.
+        convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
+            included.
+        own_units: invert the weights' block by a pseudo-inverse in the weights' own units, which
+            leaves out directions whose eigenvalue is rounding beside the largest.
 
     Raises:
         InputError: an unknown convention, or a model without a learner's gradient.
@@ -177,7 +183,8 @@ def joint_covariance(
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
-    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
+    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular
+    # block into θ's
     weights = half_inverse(outer[nt:, nt:], 0, own_units=own_units)
     half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), weights)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T

@@ -261,10 +261,8 @@ class AutodiffDynamics:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
             value = jnp.concatenate([following, parts.total])
-            return (
-                value,
-                value,
-            )  # to differentiate, and as it is: the step stands once in the program
+            # to differentiate, and as it is: the program contains the step once
+            return value, value
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
         differentiated = jax.jacrev(both, (0, 1), has_aux=True)

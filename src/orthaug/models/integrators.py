@@ -72,7 +72,7 @@ class Exponentials(NamedTuple):
 
     @classmethod
     def of(cls, linear: Any, h: float) -> Exponentials:
-        """Of A (nx, nx)."""
+        """Return the exponentials of A (nx, nx) over a step h."""
         both = jax.vmap(lambda a: _phi(a, 3))(
             jnp.stack([linear * h, linear * h / 2])
         )  # at once: less to compile
@@ -94,9 +94,17 @@ def advance(
 ) -> Any:
     """Return x one sample later.
 
-    Args: field: ẋ = F(x, u). scheme: the `Exponentials` of its linear part; None for `rk4`. row:
-        the input as `held` lays it out. step: the sampling time. looped: write the field once into
-        a program, and not for every stage: of a large one that compiles faster.
+    Args:
+        field: ẋ = F(x, u).
+        scheme: the `Exponentials` of its linear part; None for `rk4`.
+        x: the state.
+        row: the input as `held` arranges it.
+        nu: number of inputs.
+        step: the sampling time.
+        substeps: of a sample.
+        integrator: "rk4" or "exact".
+        looped: write the field once into a program, and not for every stage: a large one compiles
+            faster so.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
     stages = _stages_in_a_loop if looped else runge_kutta

@@ -148,7 +148,8 @@ def _finite(slope: Any) -> Any:
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
-_LARGE = 150  # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
+_LARGE = 150
+# operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)

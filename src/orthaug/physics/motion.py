@@ -412,7 +412,7 @@ class Motion(NotebookView):
     def values(
         self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
     ) -> dict[str, Any]:
-        """Return what every name stands for; x (nx, …), u (nu, …), p (np,).
+        """Return the value of every name; x (nx, …), u (nu, …), p (np,).
 
         Of the definitions only those that are needed.
         """

@@ -121,7 +121,7 @@ class MotionProblem:
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "m nx"]:
-        """The eigenvalues of ∂f/∂x at the initial parameters [1/s], at the guessed states where they are finite."""
+        """Eigenvalues of ∂f/∂x [1/s] at the initial parameters and the finite guessed states."""
         x, u = self.looked_at
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
@@ -140,7 +140,7 @@ class MotionProblem:
 
     @property
     def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        """Largest |eigenvalue| of ∂f/∂x [1/s] at the initial parameters and guessed states."""
         return float(np.abs(self.modes).max(initial=0.0))
 
     @property
@@ -256,9 +256,10 @@ def _check_exact(problem: MotionProblem) -> None:
         )
     if fast > _FASTEST:
         raise InputError(
-            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the motion, "
-            f'{problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a substep, at most {_FASTEST}. '
-            f"Give `substeps` (at most {MOST_SUBSTEPS}), check units and initial values, or leave the fast mode out."
+            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the "
+            f'motion, {problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a '
+            f"substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), check units "
+            "and initial values, or leave the fast mode out."
         )
 
 

@@ -33,10 +33,10 @@ def _complex_arctan2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.arctan2(np.real(a), np.real(b)) + 1j * slope / (np.real(a) ** 2 + np.real(b) ** 2)
 
 
-# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the complex
-# step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The functions of
-# numpy are analytic, these seven are not. They take the branch of the real part: at a kink that is
-# the slope of one side.
+# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the
+# complex step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The
+# functions of numpy are analytic, these seven are not. They take the branch of the real part: at a
+# kink that is the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,

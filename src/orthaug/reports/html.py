@@ -22,14 +22,16 @@ from orthaug.reports.result import FitResult
 # Colours are the notebook's own, so that a card is read on light and on dark.
 _TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
 <style>.orthaug table{border-collapse:collapse;margin:.4em 0;font-variant-numeric:tabular-nums}\
-.orthaug th,.orthaug td{text-align:left;padding:.15em .8em .15em 0;border-bottom:1px solid rgba(128,128,128,.35)}\
+.orthaug th,.orthaug td{text-align:left;padding:.15em .8em .15em 0;\
+border-bottom:1px solid rgba(128,128,128,.35)}\
 .orthaug th{font-weight:600}.orthaug .facts{opacity:.8}.orthaug p{margin:.2em 0}</style>
 <p><strong>{{ card.title }}</strong></p>
 {% for name, value in card.facts.items() %}
 <p class="facts">{{ name }}: {{ value }}</p>
 {% endfor %}
 {% for table in card.tables if table.rows %}
-<table><thead><tr>{% for head in table.columns %}<th scope="col">{{ head }}</th>{% endfor %}</tr></thead><tbody>
+<table><thead><tr>{% for head in table.columns %}<th scope="col">{{ head }}</th>{% endfor %}\
+</tr></thead><tbody>
 {% for row in table.rows %}
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}

@@ -72,8 +72,8 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     because = (
         f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
     )
-    first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
-                  if w.code == "one_step_only"), "")  # fmt: skip
+    causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
+    first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
     return PageVerdict(
         level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
     )

@@ -343,8 +343,9 @@ def _residual_lines(result: FitResult) -> list[str]:
             lag = 1 + int(np.argmax(np.abs(acf[1:])))
             largest = [(f"its own past by {acf[lag]:.2g} at lag {lag}", test.acf_band)]
             found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
-            largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
-                        for name, cross in found]  # fmt: skip
+            for name, cross in found:
+                value = cross.values[len(acf) - 1 + cross.lag]
+                largest.append((f"{name} by {value:.2g} at lag {cross.lag}", cross.band))
             parts = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
             lines.append(
                 f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "

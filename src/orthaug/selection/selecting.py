@@ -172,7 +172,7 @@ WIDTHS = (4, 8, 16)
 _RIVALS = (
     "may stand in: {}. Beside the other, the chosen term is not significant on the rows that "
     "are fitted. Its coefficient and interval are those of a model without the other; more "
-    "varied inputs tell them apart."
+    "varied inputs distinguish them."
 )
 _NOT_CONFIRMED = (
     "not confirmed on the rows that had no say in the choice: {}. The q-value there is above "
@@ -252,7 +252,7 @@ class Selection:
 
     @cached_property
     def shares(self) -> dict[str, float]:
-        """Of every chosen term, how often it is chosen over random halves of the rows that chose.
+        """Share of random halves of the rows that chose in which each chosen term is chosen.
 
         Empty where no terms were chosen from a library; linear lags are chosen as orders, and a
         network as a whole.
@@ -301,10 +301,9 @@ class Selection:
 
     @cached_property
     def rivals(self) -> dict[str, tuple[str, ...]]:
-        """Of a chosen term the candidates for which it may stand in, on the rows that `estimate` fits.
+        """Rivals of each chosen term on the rows that `estimate` fits.
 
-        Beside one of these the term is not significant, so these rows do not tell which of the two
-        acts.
+        Beside a rival the term is not significant, so these rows do not show which of the two acts.
         """
         if self.terms is None or not isinstance(self.learner, Terms):
             return {}
@@ -505,7 +504,7 @@ def select(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What the rows that choose are searched with, beyond linear lags."""
+    """Settings of the search on the rows that choose, beyond linear lags."""
 
     problem: Problem
     criterion: Criterion
@@ -531,9 +530,9 @@ class _Search:
         """
         problem, criterion, lags = self.problem, self.criterion, Lags(reach.na, reach.nb, reach.nk)
         if isinstance(learner, MLP) and not self.heard.stopped:
-            told = self.heard.of("learner")
-            beside = (learner, widths, criterion, self.blocks, told, self.runner)
-            return None, search_learners(problem, lags, tested, *beside), None, []
+            listener = self.heard.of("learner")
+            settings = (learner, widths, criterion, self.blocks, listener, self.runner)
+            return None, search_learners(problem, lags, tested, *settings), None, []
         if not isinstance(learner, Terms) or self.heard.stopped:
             return None, None, None, []
         baseline, names = problem.baseline, [channel.name for channel in problem.record.inputs]
@@ -590,7 +589,7 @@ def _parts(
 
 
 def lagged_rows(problem: Problem, lags: Lags | None) -> int:
-    """Return how many leading rows of an experiment are lags of the largest orders that are looked at."""
+    """Return the number of leading rows of an experiment that are lags, for the largest orders."""
     return _lagged(_reach(problem, lags)[0])
 
 
@@ -698,7 +697,7 @@ def _reached(
 def _terms(
     problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
 ) -> tuple[TermRuns, list[Warning], int]:
-    """Return the library of terms laid out, what is to be told of it, and how many terms could be chosen."""
+    """Return the runs of the library of terms, notes, and the number of candidates."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]

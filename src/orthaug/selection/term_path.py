@@ -248,7 +248,7 @@ class TermPath(Search):
     ways: tuple[tuple[int, ...], ...] = ()
     """Terms that ways forward kept to, before the one that had all."""
     control: Control | None = None
-    """What a term must stand beside so many candidates; None for no such rule."""
+    """The rule for a term among so many candidates; None for no such rule."""
     kept: int | None = None
     """The model that the rule left, where it took terms away; None where it took none."""
 
@@ -265,7 +265,7 @@ class TermPath(Search):
         return tuple(replace(one, chosen=i == self.kept) for i, one in enumerate(found))
 
     def rates(self) -> dict[str, float]:
-        """Of every term of the choice, the least rate of false discoveries at which it would have stayed."""
+        """Return the least rate of false discoveries at which each chosen term would remain."""
         point, texts = self.chosen.point, self.runs.library.texts
         control = self.control or Control(1.0, len(texts))
         found = control.rates(p_values(self.runs, point)) if point.chosen else ()
@@ -505,7 +505,7 @@ def _backward(path: TermPath, judged: Any) -> None:
 
 
 def _controlled(path: TermPath, judged: Any) -> int | None:
-    """Return the number of the model whose terms all stand the control.
+    """Return the number of the model whose terms all pass the control.
 
     None where those of the choice do.
     """

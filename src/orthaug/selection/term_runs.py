@@ -290,7 +290,9 @@ class TermRuns:
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """Return the normal equations of physics and all terms about a point, for p itself.
 
-        Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
+        Args:
+            point: the model about which the free run is linearised.
+            able: terms that may be chosen, beside those that are; the columns of others are zero.
             scored: which steps of the segments count, or which range of rows one step ahead; None
             for all.
         """
@@ -336,7 +338,7 @@ class TermRuns:
         return self._step_equations_of(slice(None))
 
     def _step_equations_of(self, part: slice) -> Equations:
-        """The same over a range of rows, counted over the experiments."""
+        """Return these equations over a range of rows, counted over the experiments."""
         found, before = [], 0
         for experiment in self.problem.record.experiments:
             (x, y), factors = self.rows(experiment), self.factors(experiment)

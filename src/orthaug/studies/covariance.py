@@ -51,7 +51,10 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "covariance": entries of the first start, as correlations and, as in the paper, in absolute value."""
+    """Return the figure "covariance": entries of the first start.
+
+    They are drawn as correlations and, as in the paper, in absolute value.
+    """
     figure, axes = panels(2, height=3.3)
     row = table.iloc[0]
     titles = {"correlation": "entries over √(Pᵢᵢ Pⱼⱼ)", "pseudo": "entries in absolute value"}

@@ -151,7 +151,10 @@ def findings(table: pd.DataFrame) -> list[Finding]:
 
 
 def _stopped(table: pd.DataFrame, structure: str) -> str:
-    """Return what the same sum is when training stops early, where that was run: what is trained longer fits noise."""
+    """Return a sentence on the same sum when training stops early, where that was run.
+
+    A network that is trained longer fits noise.
+    """
     own = rows_of(table, structure=structure)
     early, full = (rows_of(own, regularization=kind) for kind in ("stopping", "none"))
     if early.empty:

@@ -57,7 +57,7 @@ class Command:
 
     @property
     def running(self) -> bool:
-        """Whether the process still runs."""
+        """True while the process still runs."""
         return self.code is None
 
     @property

@@ -87,7 +87,7 @@ class Session:
 
     @property
     def untouched(self) -> bool:
-        """Whether the session has not been used yet."""
+        """True if the session has not been used yet."""
         return not self.commands and self.data is None and set(self.authors) <= {"file"}
 
     def changed(self, what: str) -> None:
@@ -208,7 +208,7 @@ class Session:
 
     @property
     def _may_begin(self) -> bool:
-        """Whether looking at a file may begin the spec.
+        """True if looking at a file may begin the spec.
 
         It may where there is no spec, or one that an earlier look began and nobody has edited.
         """
@@ -223,7 +223,7 @@ class Session:
 
     @property
     def apart(self) -> bool:
-        """Whether the spec does not name the file that was looked at."""
+        """True if the spec does not name the file that was looked at."""
         return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
 
     def names(self, file: Path) -> bool:

@@ -304,7 +304,8 @@ MOTION = """
 [motion]
 [motion.states]
 x = {{ derivative = "v", start = "{output}"{x} }}
-v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", learned = true{v} }}
+v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", \
+learned = true{v} }}
 [motion.outputs]
 {output} = "x"
 [motion.parameters]

@@ -65,8 +65,8 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
         return {"refused": str(error)}
     except MemoryError:
         return {
-            "refused": "there is not enough memory to look at these data; take fewer rows, or every "
-            "n-th."
+            "refused": "there is not enough memory to look at these data; take fewer rows, or "
+            "every n-th."
         }
     except OSError as error:
         return {
