@@ -15,7 +15,7 @@ from orthaug._base.progress import StopTraining
 from orthaug.fitting import one_step
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.structures import Orthogonal
-from orthaug.fitting.training import planned
+from orthaug.fitting.training import plan_runs
 from orthaug.models.streaming import Stream
 from orthaug.physics.problem import pose
 
@@ -56,7 +56,7 @@ def test_it_begins_at_the_weights_where_the_run_over_some_rows_ended(many, regul
     assert len(few.problem.record) == 800 and few.few is None
     np.testing.assert_array_equal(few.scaling.halfwidth, task.scaling.halfwidth)
     np.testing.assert_array_equal(few.unit, task.unit)
-    (start,) = planned(task.bound, range(1), [regularization])
+    (start,) = plan_runs(task.bound, range(1), [regularization])
     first = few.run(LM, start.weights, Orthogonal(), regularization)
     expected = replace(task, few=None).run(LM, first.w, Orthogonal(), regularization)
     found = fitted(regularization=regularization)

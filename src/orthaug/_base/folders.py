@@ -377,7 +377,7 @@ def not_ours(folder: Path) -> str | None:
     Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's
     own.
     """
-    listed = _listed(folder / MANIFEST)
+    listed = _listed_checksums(folder / MANIFEST)
     if listed is None:
         name = next(_names(folder), None)
         return None if name is None else f"{name} and no {MANIFEST} that says orthaug wrote it"
@@ -409,7 +409,7 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _listed(path: Path) -> dict[str, str] | None:
+def _listed_checksums(path: Path) -> dict[str, str] | None:
     """Return the checksums of a manifest; None where there is none of orthaug's."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -70,7 +70,7 @@ class RunCancelled(Exception):
     """Another run failed, or the user pressed Ctrl-C: this run's result is no longer wanted."""
 
 
-def spread(
+def run_all(
     function: Callable[[Item, Callable[[], None]], Result],
     items: Sequence[Item],
     workers: int | None = None,
@@ -79,10 +79,10 @@ def spread(
 
     Arguments are those of `each`.
     """
-    return list(each(function, items, workers))
+    return list(iterate_results(function, items, workers))
 
 
-def each(
+def iterate_results(
     function: Callable[[Item, Callable[[], None]], Result],
     items: Sequence[Item],
     workers: int | None = None,
@@ -156,7 +156,7 @@ class Threads:
 
             return function(given, item, report)
 
-        return each(one, list(enumerate(items)))
+        return iterate_results(one, list(enumerate(items)))
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

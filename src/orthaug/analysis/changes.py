@@ -27,7 +27,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_matrix
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response, Trajectory
-from orthaug.physics.shared import seen
+from orthaug.physics.shared import seen_columns
 
 WORTH = 0.05  # of the error's variance: what explains less is no change worth making
 _INPUTS_FURTHER, _OUTPUTS_FURTHER = 10, 4  # lags beyond the largest of the model that are tried
@@ -351,7 +351,7 @@ class Candidates:
         model, problem = self.fit.model, self.fit.problem
         if model.form.bound is None:
             return "a learner"
-        visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+        visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
         return (
             f"a learner that also sees {', '.join(hidden)}"

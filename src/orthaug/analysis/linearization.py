@@ -20,7 +20,7 @@ from orthaug.analysis.linear_steps import (
     step_of,
     unrest_along,
 )
-from orthaug.analysis.linear_system import METHODS, Continuous, System, converted
+from orthaug.analysis.linear_system import METHODS, Continuous, System, convert_to_continuous
 from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
@@ -108,10 +108,10 @@ def linearize(
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
     measured = None if record is None else measured_response(record)
-    return Linearization(views, measured, _held(search, given, record), tuple(warnings))
+    return Linearization(views, measured, _held_clause(search, given, record), tuple(warnings))
 
 
-def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
+def _held_clause(search: Search, given: Mapping[str, float], record: Record | None) -> str:
     """Return a clause on the source of inputs that nobody fixed."""
     if all(name in given for name in search.step.inputs):
         return "given"
@@ -193,7 +193,7 @@ def _view(
         own = _system(search, point, spread, None)
         found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
-        found = converted(
+        found = convert_to_continuous(
             sampled, method, None if isinstance(step, MotionStep) else step.memory, names
         )
     poles = poles_of(sampled, own, freedom)

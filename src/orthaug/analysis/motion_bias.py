@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
-from orthaug.analysis.absorbed import completing
+from orthaug.analysis.absorbed import complementary_parameters
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
 from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.motion_suspects import (
     MotionSuspect,
     check_motion_suspects,
     equations_of,
-    softened,
+    soften_jumps,
     usual_motion_suspects,
 )
 from orthaug.analysis.robustness import block_of
@@ -219,7 +219,7 @@ class MotionLinearization:
         apart = (
             np.zeros(len(names), dtype=bool)
             if trained
-            else ~np.isin(np.arange(len(names)), completing(basis))
+            else ~np.isin(np.arange(len(names)), complementary_parameters(basis))
         )
         moved, dw = response.moved(k, apart)
         if self.learns:
@@ -417,7 +417,7 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
     if fit.model.form.bound is None:
         return []
     field = fit.split_by.field
-    smooth = softened(suspects, fit.problem.motion, fit.values, field.x, field.u)
+    smooth = soften_jumps(suspects, fit.problem.motion, fit.values, field.x, field.u)
     return suspected_bias(fit, smooth) if smooth else []
 
 
@@ -431,7 +431,7 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
         return [], []
     seen = [suspect for suspect in linearization.usual() if linearization.sees(suspect)]
-    smooth = softened(
+    smooth = soften_jumps(
         seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u
     )
     table = linearization.table((*seen, *smooth))  # one program for all

@@ -96,7 +96,7 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = solved(
+        found[free] = solve_scaled(
             self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k]
         )
         return found[: self.parameters], found[self.parameters + self.terms :]
@@ -110,7 +110,7 @@ class TermsResponse:
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
         """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
-        return np.asarray(_along(self.form, self.numbers, dw, x, u))
+        return np.asarray(_learned_change(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
         """Return the share of the term's effect on the outputs that the fit takes up, in [0, 1].
@@ -172,7 +172,7 @@ class TermsResponse:
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
         across = self.information[self.fitted, i]
-        row[self.fitted] = -solved(self.penalised[np.ix_(self.fitted, self.fitted)], across)
+        row[self.fitted] = -solve_scaled(self.penalised[np.ix_(self.fitted, self.fitted)], across)
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
@@ -196,7 +196,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
     return TermsResponse(place, form, numbers, information, gradient, slope, fitted, len(added))
 
 
-def solved(matrix: Matrix, right: Vector) -> Vector:
+def solve_scaled(matrix: Matrix, right: Vector) -> Vector:
     """Return least squares with unit columns; unknowns without information stay 0."""
     if not len(matrix):
         return np.zeros(0)
@@ -208,17 +208,17 @@ def solved(matrix: Matrix, right: Vector) -> Vector:
 
 
 @partial(jax.jit, static_argnames="form")
-def _along(
+def _learned_change(
     form: MotionDynamics,
     numbers: Numbers,
     dw: Float[Array, "nw"],
     x: Float[Array, "m nx"],
     u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
-    def learned(w: Any) -> Any:
+    def learned_output(w: Any) -> Any:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
 
-    return jax.jvp(learned, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]
+    return jax.jvp(learned_output, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +276,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w])
     )
     step = np.zeros(len(free))
-    step[free] = solved(information[np.ix_(free, free)], gradient[free])
+    step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
     std = np.full(len(c), np.nan) if fit.std is None else fit.std
     errors = np.abs(value) / np.where(std > 0, std, np.nan)

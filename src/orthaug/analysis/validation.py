@@ -21,7 +21,7 @@ from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
     Ratio,
-    blocked,
+    held_out_blocks,
     mean_square,
     squared_errors,
 )
@@ -128,7 +128,7 @@ def free_run_error(
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 
 
-def trial_on(
+def score_trial(
     where: str,
     record: Record,
     skip: tuple[int, ...],
@@ -188,7 +188,7 @@ def cross_validate(
     Raises:
         InputError: too few rows for so many blocks.
     """
-    folds = blocked(record, blocks, start)
+    folds = held_out_blocks(record, blocks, start)
     unit = np.std(np.concatenate([e.outputs for e in record.experiments]), axis=0)
 
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
@@ -384,7 +384,7 @@ def verdict(
         check_type(record, Record, f"tests[{name!r}]", "a Record")
         ordered = fit.model.fitting(record, need_outputs=True)
         skips = (skip,) * len(ordered.experiments)
-        trials.append(trial_on(str(name), ordered, skips, alone.model, fit.model))
+        trials.append(score_trial(str(name), ordered, skips, alone.model, fit.model))
         beyond += extrapolation(str(name), fit.reach(ordered), *trained)
     found = judge(trials, beyond)
     assert found is not None

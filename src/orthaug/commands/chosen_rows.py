@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
-from orthaug.commands.parts import expanded
+from orthaug.commands.parts import expand_files
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
-from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, parted
+from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, split_record
 
 if TYPE_CHECKING:
     from orthaug.commands.data_sections import PartSection
@@ -70,7 +70,7 @@ def parts_of(
         return Parts(record, record, CONDITIONAL)
     if halves is False:
         return Parts(record, record, Intervals.none("`selection.halves` is false"))
-    files, ranges = expanded(path, section.files, "train"), Rows.of((), section.rows).ranges
+    files, ranges = expand_files(path, section.files, "train"), Rows.of((), section.rows).ranges
     fault = _not_cut(job, len(files) * max(len(ranges), 1))
     by = None
     if len(files) > 1:
@@ -78,7 +78,7 @@ def parts_of(
     try:
         if fault:
             raise InputError(fault)
-        return parted(record, baseline, lags, by=by, **({"least": 1} if halves else {}))
+        return split_record(record, baseline, lags, by=by, **({"least": 1} if halves else {}))
     except InputError as error:
         if halves:
             raise InputError(f"{path}: 'selection.halves': {error}.") from None
@@ -100,10 +100,10 @@ def _not_cut(job: LaggedJob, expected: int) -> str:
     return ""
 
 
-def cut(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
+def split_rows(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
     """Return the rows that chose and those that are fitted, as a spec says them."""
     section, record = job.spec.data.train, job.train.record
-    files = expanded(job.path, section.files, "train")
+    files = expand_files(job.path, section.files, "train")
     whole = Rows.of(files, section.rows)
     if parts.fitted is record:
         return whole, whole
@@ -138,7 +138,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
         or not isinstance(bound.learner, Terms)
     ):
         return None
-    train = Rows.of(expanded(job.path, spec.data.train.files, "train"), spec.data.train.rows)
+    train = Rows.of(expand_files(job.path, spec.data.train.files, "train"), spec.data.train.rows)
     if Rows.of(chosen.files, chosen.rows).meets(train, job.path.parent):
         return Intervals("none", _CONDITIONAL)
     return of_parts(job.problem.count)

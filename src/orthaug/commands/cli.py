@@ -365,14 +365,14 @@ def reproduce(
 
     folder = out or Path("orthaug-out/reproduction")
     reproduction.check_output(folder, force=force)
-    entries = reproduction.chosen(name)
+    entries = reproduction.choose_studies(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
     prepare_jax()
     client = None
     if scheduler is not None:
-        from orthaug.models.cluster import connected
+        from orthaug.models.cluster import connect
 
-        client = connected(scheduler, None)
+        client = connect(scheduler, None)
     with study_bars() as progress:
         reproduced = reproduction.reproduce(
             entries, pipeline=pipeline, small=small, progress=progress, client=client

@@ -151,9 +151,9 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
         InputError: one that is not installed, or cannot be reached.
     """
     if kind == "dask":
-        from orthaug.models.cluster import Dask, connected
+        from orthaug.models.cluster import Dask, connect
 
-        return Dask(connected(section.scheduler, section.workers))
+        return Dask(connect(section.scheduler, section.workers))
     if kind == "devices":
         from orthaug.models import hosts
         from orthaug.models.devices import Devices

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, value_text
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.commands.parts import Part
@@ -264,7 +264,7 @@ def date_of_results() -> datetime:
         epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000
     ):
         raise InputError(
-            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to "
+            f"SOURCE_DATE_EPOCH: found {value_text(epoch)}; expected whole seconds since 1970 up to "
             "the year 9999. Unset it for the date of today."
         )
     return datetime.fromtimestamp(int(epoch), UTC)

@@ -23,7 +23,7 @@ from orthaug.fitting.rules import (
     check_motion_choices,
     check_scored,
     check_solver,
-    tried,
+    choose_regularizations,
 )
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MeasurePlace
@@ -154,7 +154,7 @@ def _check_choices(spec: Spec, motion: Motion) -> None:
         check_motion_choices(motion, learner, structure, criterion, solver)
         given, validated = spec.training.regularization, spec.data.validation is not None
         conditions = {"linear": False, "validated": validated, "learner": learner}
-        choices = tried(given, solver, criterion, structure, **conditions)
+        choices = choose_regularizations(given, solver, criterion, structure, **conditions)
         check_solver(solver, criterion, choices)
     except KeyedError as error:
         raise InputError(f"'{_place(error)}'{error.words}.") from None

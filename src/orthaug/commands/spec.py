@@ -35,7 +35,7 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
-from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
@@ -403,7 +403,7 @@ class Spec(Section):
             self.declared_structure(kind),
         )
         conditions: dict[str, Any] = {"linear": linear, "validated": validated}
-        return tried(
+        return choose_regularizations(
             given,
             *declared,
             **conditions,

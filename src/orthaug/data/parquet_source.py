@@ -27,7 +27,7 @@ from orthaug.data.record import (
     check_step,
     same_step,
 )
-from orthaug.data.sources import joined, stretches
+from orthaug.data.sources import join_pieces, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
 BATCH_ROWS = 32_768  # rows that are built at once: several such blocks are in memory
@@ -179,7 +179,7 @@ class ParquetSource:
                 shift = partition.start - before
                 found += partition.between(a + shift, b + shift, 0)
         step = self.sampling_time
-        return [replace(e, start_time=e.start_time + step * e.offset) for e in joined(found)]
+        return [replace(e, start_time=e.start_time + step * e.offset) for e in join_pieces(found)]
 
     def check_unchanged(self) -> None:
         """Raise InputError where a file is not the one that was opened."""
@@ -243,7 +243,7 @@ def open_parquet(
             runs, step = _look(file, path, total, time, experiment)
         if step is not None:
             steps.append((path, step))
-        for start, stop in _grouped(groups, partition_rows):
+        for start, stop in _group_rows(groups, partition_rows):
             partitions.append(
                 RowGroups(str(path), start, stop, runs.within(start, stop), reading, stamp)
             )
@@ -414,7 +414,7 @@ class _BatchScan:
         return Runs(ranges, tuple(self.began)), step
 
 
-def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
+def _group_rows(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
     """Return row ranges of partitions: row groups joined until there are `least` rows."""
     start = stop = 0
     for rows in groups:

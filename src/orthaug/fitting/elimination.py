@@ -197,7 +197,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
-    shared = _shared(structure, problem)
+    shared = _shared_directions(structure, problem)
     partly = structure.projects and np.isfinite(baseline.bounds).any() and not shared.all
     return Elimination(
         to_coordinates=projection.to_coordinates,
@@ -212,7 +212,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     )
 
 
-def _shared(structure: Structure, problem: Problem) -> Shared:
+def _shared_directions(structure: Structure, problem: Problem) -> Shared:
     names = problem.baseline.names
     return Shared(names, np.eye(len(names))) if structure.shared == "all" else problem.shared
 
@@ -225,7 +225,7 @@ def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()
     Args:
         fixed: entries of θ at a bound, which no direction moves.
     """
-    shared = _shared(structure, problem)
+    shared = _shared_directions(structure, problem)
     return None if shared.all else shared.leaving(fixed).basis
 
 

@@ -28,9 +28,14 @@ from orthaug.inference.covariance import (
 from orthaug.inference.influence import hc3, one_step_slopes
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
-from orthaug.inference.nearly_shared import grown
+from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
-from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under, streamed_slope
+from orthaug.inference.splitting import (
+    MeasureSplit,
+    learner_slope,
+    split_by_measure,
+    streamed_slope,
+)
 from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
@@ -222,11 +227,11 @@ class Estimate(AnyFit):
             self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
         )
         joint = self.model.statistics.joint(len(self.theta))
-        under = split_under(measure, self.model, support, joint)
+        under = split_by_measure(measure, self.model, support, joint)
         if under.covariance is not None:
             training = self.covariance if self.measure is None else None
             training = (
-                split_under(Training(), self.model, support, joint).covariance
+                split_by_measure(Training(), self.model, support, joint).covariance
                 if training is None
                 else training
             )
@@ -368,7 +373,7 @@ class Estimate(AnyFit):
 
     def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
         """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
-        return grown(
+        return enlarge_covariance(
             covariance, statistics, None if self.model.shared is None else self.problem.shared
         )
 

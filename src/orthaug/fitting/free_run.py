@@ -73,7 +73,7 @@ def train_physics_only(
         ends += _lengthen(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
-    best = _best(ends)
+    best = _lowest_end(ends)
     spent = {"iterations": sum(e.iterations for e in ends), "seconds": sum(e.seconds for e in ends)}
     return None if best is None else best._replace(**spent)
 
@@ -146,7 +146,7 @@ def _over_whole(
     return [own._replace(iterations=end.iterations, seconds=end.seconds)]
 
 
-def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
+def _lowest_end(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
     """Return the lowest end over whole experiments, or over segments where all diverge."""
     usable = [end for end in ends if end.ending.usable]
     flying = [end for end in usable if np.isfinite(end.mean_square)]

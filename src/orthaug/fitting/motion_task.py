@@ -119,10 +119,10 @@ def _descend(
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
     """Return whether the runs follow most of the outputs' variation."""
-    return bool(_left(segmented, free_fit) < _POOR**2 * segmented.residuals)
+    return bool(_squared_errors(segmented, free_fit) < _POOR**2 * segmented.residuals)
 
 
-def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
+def _squared_errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
     """Return the sum of squared errors, each output in its deviation.
 
     Infinite where they are too large to square.
@@ -145,7 +145,7 @@ def _fine_enough(
         and segmented.dynamics.substeps < MOST_SUBSTEPS
     ):
         finer = segmented.refined(2 * segmented.dynamics.substeps)
-        if moved_by(segmented.alone, finer.alone, free_fit) <= _FINE:
+        if substep_shift(segmented.alone, finer.alone, free_fit) <= _FINE:
             break
         again = _descend_on(finer.alone, solver, free_fit)
         if again is None:
@@ -154,7 +154,9 @@ def _fine_enough(
     return segmented, free_fit
 
 
-def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit) -> float:
+def substep_shift(
+    segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit
+) -> float:
     """Return by what share of the residual finer integrator steps move the outputs."""
     point = free_fit.end.point
     runs = []
@@ -167,7 +169,7 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     scored = np.asarray(segmented.segments.scored)[:, :, None]
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / segmented.deviation[:, None]
-        ratio = np.sqrt(np.sum(moved**2) / max(_left(segmented, free_fit), 1e-300))
+        ratio = np.sqrt(np.sum(moved**2) / max(_squared_errors(segmented, free_fit), 1e-300))
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 

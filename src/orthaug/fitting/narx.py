@@ -15,7 +15,7 @@ from orthaug.fitting.scikit_learn import (
     Augmented,
     Physics,
     baseline_of,
-    checked,
+    check_arrays,
     checked_again,
     input_names,
     learner_of,
@@ -132,7 +132,7 @@ class AugmentedNARX(Augmented):
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
-        X, y = checked(self, X, y)
+        X, y = check_arrays(self, X, y)
         names = input_names(self)
         self.output_names_ = output_names(given, y.shape[1], names)
         baseline = baseline_of(self.physics, self._layout(names), self.output_names_)

@@ -24,7 +24,7 @@ from orthaug._base.checks import (
     check_type,
     is_number,
 )
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, value_text
 from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
@@ -36,7 +36,7 @@ from orthaug.fitting.recursive_rows import (
     WhitenedRows,
     begin,
     joined_rows,
-    trained,
+    training_rows,
     whitened_rows,
 )
 from orthaug.fitting.residual_band import ResidualMonitor
@@ -109,8 +109,8 @@ class Recursive:
     ) -> None:
         check_choice(start, ("fit", "empty"), "`start`")
         if check_number(quiet, "quiet", positive=True) < 1:
-            raise InputError(f"`quiet` must be 1 row or more; got {shown(quiet)}.")
-        began = trained(fit, training)
+            raise InputError(f"`quiet` must be 1 row or more; got {value_text(quiet)}.")
+        began = training_rows(fit, training)
         factor = forgetting_factor(forgetting, memory, began.model.sampling_time)
         recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
         self._set(began.model, recursion, ResidualMonitor(reference), inflation, began.used)
@@ -463,13 +463,13 @@ def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> flo
         if seconds < sampling_time:
             raise InputError(
                 f"`memory` must be at least one sampling time, {sampling_time:g} s; got "
-                f"{shown(memory)}."
+                f"{value_text(memory)}."
             )
         return math.exp(-sampling_time / seconds)
     if forgetting is None:
         return 1.0
     if not is_number(forgetting) or not _LEAST_FACTOR <= forgetting <= 1:
         raise InputError(
-            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}."
+            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {value_text(forgetting)}."
         )
     return float(forgetting)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from orthaug._base.checks import check_count, nearest
-from orthaug._base.errors import InputError, TrainingError, shown
+from orthaug._base.errors import InputError, TrainingError, value_text
 from orthaug._base.jax import jax
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
 from orthaug.data.record import Record
@@ -154,7 +154,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self.estimate_
 
 
-def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+def check_arrays(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's checks.
 
     Raises:
@@ -196,7 +196,7 @@ def input_names(estimator: Any) -> tuple[str, ...]:
     """
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
-    return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
+    return tuple(name or _free_name(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
@@ -215,10 +215,10 @@ def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]
         is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named
     ):
         return tuple(named)
-    return tuple(_free("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
+    return tuple(_free_name("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
 
 
-def _free(name: str, taken: Sequence[str]) -> str:
+def _free_name(name: str, taken: Sequence[str]) -> str:
     while name in taken:
         name += "_"
     return name
@@ -278,7 +278,7 @@ def baseline_of(
         line = {
             (f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout
         }
-        physics = {_free("intercept", [*line]): "1"} | line
+        physics = {_free_name("intercept", [*line]): "1"} | line
     elif (
         not isinstance(physics, str)
         and isinstance(physics, Sequence)
@@ -300,7 +300,7 @@ def baseline_of(
         raise InputError(
             "`physics` must be 'linear', a list of expressions or Terms, a mapping of "
             "parameters to expressions, a Baseline, or a function of a row; got "
-            f"{shown(physics)}."
+            f"{value_text(physics)}."
         )
     for term in physics:
         _check_columns(term.regressor, names)

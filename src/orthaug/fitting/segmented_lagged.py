@@ -27,13 +27,13 @@ from orthaug.physics.problem import Problem
 _SMALL = 4096
 
 
-def lagged(task: OneStepTask) -> Lagged:
+def lagged_dynamics(task: OneStepTask) -> Lagged:
     """Return the dynamics of a problem and its learner."""
     problem = task.problem
     return Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
 
 
-def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
+def declared_settings(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
     """Return the settings of a segmented problem that come from task and criterion.
 
     They are the same wherever the segments are.
@@ -72,10 +72,16 @@ class SegmentedLagged(SegmentedProblem):
         Raises:
             InputError: nothing would be scored.
         """
-        dynamics, record, sums = lagged(task), task.problem.record, SegmentSums.of(task.engine)
+        dynamics, record, sums = (
+            lagged_dynamics(task),
+            task.problem.record,
+            SegmentSums.of(task.engine),
+        )
         small = like is not None and like.segments.scored.size <= _SMALL
         layout = Layout.of(record, dynamics, criterion, like if small else None, task.engine.shares)
-        return cls(**layout._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
+        return cls(
+            **layout._asdict(), **declared_settings(task, criterion), dynamics=dynamics, sums=sums
+        )
 
     @property
     def problem(self) -> Problem:

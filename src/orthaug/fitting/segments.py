@@ -235,7 +235,7 @@ def _steps_at_once(
         state, states = jax.lax.scan(
             lambda state, row: (side_by_side(state, row), state), state, inputs
         )
-        steps = dynamics.local(numbers, _flat(states), _flat(inputs))
+        steps = dynamics.local(numbers, _flatten(states), _flatten(inputs))
         value, to_state, to_unknowns = (
             part.reshape(*part.shape[:-1], size, width) for part in steps
         )
@@ -261,7 +261,7 @@ def _steps_at_once(
     return jax.lax.scan(block, carry, cut)[0][2:]
 
 
-def _flat(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
+def _flatten(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
     steps, n, m = part.shape
     return jnp.moveaxis(part, 0, 1).reshape(n, steps * m)  # n = 0 of a motion without inputs
 

@@ -59,7 +59,7 @@ def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
     return squares / np.sqrt(np.outer(freedom, freedom))
 
 
-def whitening(noise: Matrix) -> Matrix | None:
+def whitening_matrix(noise: Matrix) -> Matrix | None:
     """Return W with `W Σ Wᵀ = I` (ny, ny).
 
     None for a covariance that is singular, as of outputs without errors.
@@ -68,7 +68,7 @@ def whitening(noise: Matrix) -> Matrix | None:
     return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
 
 
-def mixing(noise: Matrix) -> Matrix:
+def mixing_matrix(noise: Matrix) -> Matrix:
     """Return M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
     values, vectors = np.linalg.eigh(noise)
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
@@ -178,7 +178,8 @@ def joint_covariance(
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
     share = problem.count / len(problem.rows)  # of which the rows in memory are a subsample
     outer, middle = (
-        share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened))
+        share * projected_gram(engine, bound, w, rows, m)
+        for m in (np.eye(ny), mixing_matrix(whitened))
     )
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
@@ -229,7 +230,9 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 def _variances(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
-    return jax.lax.map(lambda rows: jnp.sum(_along(form, numbers, rows, root) ** 2, axis=0), x)
+    return jax.lax.map(
+        lambda rows: jnp.sum(_slopes_along(form, numbers, rows, root) ** 2, axis=0), x
+    )
 
 
 @partial(jax.jit, static_argnames="form")
@@ -239,13 +242,13 @@ def changes(
     """Return how far each prediction moves along the columns of `root`."""
 
     def one_chunk(rows: Any) -> Any:
-        moved = _along(form, numbers, rows, root)
+        moved = _slopes_along(form, numbers, rows, root)
         return moved.reshape(-1, moved.shape[-1])
 
     return jax.lax.map(one_chunk, x)
 
 
-def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
+def _slopes_along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)

@@ -257,7 +257,7 @@ class AutodiffDynamics:
         """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
-        def both(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
+        def value_twice(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
             value = jnp.concatenate([following, parts.total])
@@ -265,7 +265,7 @@ class AutodiffDynamics:
             return value, value
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
-        differentiated = jax.jacrev(both, (0, 1), has_aux=True)
+        differentiated = jax.jacrev(value_twice, (0, 1), has_aux=True)
         slopes, value = jax.vmap(differentiated, (-1, None, -1), -1)(states, unknowns, inputs)
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))

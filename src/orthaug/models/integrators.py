@@ -23,7 +23,7 @@ Field = Callable[[Any, Any], Any]
 """F(x (nx,), u (nu,)) → (nx,)."""
 
 
-def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
+def inputs_at_points(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     """Return the inputs (N, nu) at the points of each sample that a step reads, (N, points nu).
 
     One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
@@ -33,16 +33,16 @@ def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     if hold == "zero-order" or not nu:
         return inputs
     if hold == "first-order" or rows < 4:
-        return _stacked(inputs, np.concatenate([inputs[1:], inputs[-1:]]))
+        return _interleave(inputs, np.concatenate([inputs[1:], inputs[-1:]]))
     from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
 
     spline, k = CubicSpline(np.arange(rows), inputs), np.arange(rows)
-    return _stacked(
+    return _interleave(
         *(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1))
     )
 
 
-def _stacked(*points: Matrix) -> Matrix:
+def _interleave(*points: Matrix) -> Matrix:
     return np.stack(points, axis=1).reshape(len(points[0]), -1)
 
 

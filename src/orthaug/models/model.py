@@ -46,7 +46,7 @@ def _free_run(
 
 
 @partial(jax.jit, static_argnames="form")
-def _ahead(
+def _last_outputs(
     form: Dynamics,
     numbers: Numbers,
     states: Float[Array, "m n0"],
@@ -295,7 +295,9 @@ class Model(RecordModel, NotebookView):
             1, _WINDOW_CELLS // max(1, windows[0].size)
         )  # windows overlap: they are copied batch by batch
         return _in_batches(
-            lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest
+            lambda s, u: _last_outputs(self.form, self.numbers, s, u, horizon),
+            (states, windows),
+            largest,
         )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:

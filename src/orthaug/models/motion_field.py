@@ -18,7 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.expressions import Expression
-from orthaug.models.beyond import beyond_of, remaining, within
+from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.physics.motion import Motion
@@ -85,9 +85,9 @@ class MotionField:
         if numbers.limits is None:
             return self.learned(numbers, x, u)
         z = self.seen(x, u)
-        inside = within(numbers.limits, z)
+        inside = clip_to_range(numbers.limits, z)
         moved = numbers.pull @ (inside - z)
-        share = remaining(self.beyond, numbers.limits, z)
+        share = remaining_factor(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
         split, own = (
             self.motion.coordinates.physical(q, jnp)

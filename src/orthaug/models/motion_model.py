@@ -61,7 +61,7 @@ def _run(
 
 
 @partial(jax.jit, static_argnames="form")
-def _last(
+def _last_output(
     form: MotionDynamics,
     numbers: Numbers,
     states: Float[Array, "n0 m"],
@@ -380,7 +380,7 @@ class MotionModel(RecordModel, NotebookView):
         rows = rows[: len(inputs)]
         size = max(FIRST_ROWS, self.window)
         windows = Windows(
-            _padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None]
+            _pad(inputs, size), _pad(rows, size), (np.arange(size) < len(rows))[:, None]
         )
         guess = self.form.start(rows, [0]).T
         settled = settle(
@@ -445,7 +445,7 @@ class MotionModel(RecordModel, NotebookView):
             ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
             pieces.append(
                 [
-                    np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)]
+                    np.asarray(_last_output(*end, settled, following, steps)).T[: len(chosen)]
                     for end in ends
                 ]
             )
@@ -453,5 +453,5 @@ class MotionModel(RecordModel, NotebookView):
         return outputs, physics
 
 
-def _padded(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
+def _pad(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])[..., None]

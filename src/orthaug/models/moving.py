@@ -15,7 +15,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
-from orthaug.models.integrators import UNROLLED, Exponentials, advance, held, input_at
+from orthaug.models.integrators import UNROLLED, Exponentials, advance, input_at, inputs_at_points
 from orthaug.models.motion_field import MotionField
 from orthaug.physics.motion_problem import guess, layout_of
 
@@ -72,7 +72,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     def physics(x: Any, c: Any) -> Any:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiated(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c)
     to_x, to_c = _finite(to_x), _finite(to_c)
     states, _ = form.motion.learned
     if form.bound is None or not states:
@@ -112,7 +112,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiated(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
     states, outputs = form.motion.learned
     if form.bound is not None and outputs:
@@ -123,7 +123,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
 
 
-def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+def _differentiate(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
     """Return the value and its slopes by x and c.
 
     Few entries are differentiated one at a time, without what an entry does not touch.
@@ -192,7 +192,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        return held(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
+        return inputs_at_points(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """Return states and inputs by name."""
@@ -289,12 +289,12 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         """
         scheme, by_theta = numbers.scheme
 
-        def following(scheme: Any, state: Any, row: Any) -> Any:
+        def next_state(scheme: Any, state: Any, row: Any) -> Any:
             return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
 
         def along(moved: Any) -> Any:
             return jax.vmap(
-                lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1],
+                lambda x, row: jax.jvp(lambda s: next_state(s, x, row), (scheme,), (moved,))[1],
                 -1,
                 -1,
             )(state, inputs)

@@ -11,7 +11,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, value_text
 from orthaug._base.jax import Array, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.data.regressors import Lags
@@ -69,7 +69,7 @@ class Terms:
             ):
                 raise InputError(
                     f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got "
-                    f"{shown(given)}."
+                    f"{value_text(given)}."
                 )
             object.__setattr__(self, name, tuple(given))
         check_fields(self)
@@ -103,7 +103,7 @@ class Terms:
         Raises:
             InputError: too many terms, or an excluded one that is none.
         """
-        return self if not self.degree else replace(self, **_written(self.library(signals)))
+        return self if not self.degree else replace(self, **_library_entries(self.library(signals)))
 
     def library(self, signals: Sequence[str]) -> TermLibrary:
         """Return the terms as products of few factors."""
@@ -145,7 +145,7 @@ class Terms:
         return jnp.asarray(tree) @ z
 
 
-def _written(library: TermLibrary) -> dict[str, Any]:
+def _library_entries(library: TermLibrary) -> dict[str, Any]:
     return {
         "terms": library.texts,
         "degree": 0,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, value_text
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import check_sampling_constant
@@ -203,7 +203,7 @@ class Motion(NotebookView):
         for name, function in (("f", f), ("h", h)):
             if not callable(function):
                 raise InputError(
-                    f"`{name}` must be a function {name}(x, u, p); got {shown(function)}."
+                    f"`{name}` must be a function {name}(x, u, p); got {value_text(function)}."
                 )
         states = [State(state) if isinstance(state, str) else state for state in states]
         outputs = [Output(output) if isinstance(output, str) else output for output in outputs]
@@ -229,7 +229,7 @@ class Motion(NotebookView):
         if substeps is not None and not (whole and 1 <= substeps <= MOST_SUBSTEPS):
             raise InputError(
                 f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got "
-                f"{shown(substeps)}."
+                f"{value_text(substeps)}."
             )
         if integrator == "discrete" and hold != "zero-order":
             raise InputError("a discrete motion has no input between samples; leave `hold` out.")
@@ -272,7 +272,7 @@ class Motion(NotebookView):
                     check_not_sampling_time(name, what)
                 if not is_name(name, FUNCTIONS):
                     raise InputError(
-                        f"{shown(name)} cannot name {what}; use letters, digits and "
+                        f"{value_text(name)} cannot name {what}; use letters, digits and "
                         "underscores, not starting with a digit, and none of "
                         f"{', '.join(sorted(FUNCTIONS))}."
                     )
@@ -297,7 +297,7 @@ class Motion(NotebookView):
         elif start is not None and not is_number(start):
             raise InputError(
                 f"the start of '{state.name}' must be a finite number or an output; got "
-                f"{shown(start)}."
+                f"{value_text(start)}."
             )
 
     def _check_used(self) -> None:

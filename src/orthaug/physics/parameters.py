@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, value_text
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
@@ -294,7 +294,9 @@ def check_parameters(
             )
     for name, value in constants.items():
         if not is_number(value):
-            raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
+            raise InputError(
+                f"the constant '{name}' must be a finite number; got {value_text(value)}."
+            )
     for p in parameters:
         check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
@@ -303,7 +305,7 @@ def check_parameters(
             )
         if not is_number(p.initial):
             raise InputError(
-                f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}."
+                f"the initial value of '{p.name}' must be a finite number; got {value_text(p.initial)}."
             )
         check_label(p.unit, f"the unit of '{p.name}'")
         check_bounds(p.name, p.min, p.max)
@@ -353,13 +355,13 @@ def _check_identifiable(physics: PhysicsMap) -> None:
             best = sensitivity
     if best is not None and not best.full_rank:
         raise InputError(
-            f"theta does not determine the physical parameters: {tied(best)} "
+            f"theta does not determine the physical parameters: {tied_text(best)} "
             f"({len(physics.theta_names)} theta, rank {best.rank} of {best.columns}). Make one "
             "of them a constant, or add a term that distinguishes them."
         )
 
 
-def tied(sensitivity: Excitation) -> str:
+def tied_text(sensitivity: Excitation) -> str:
     """Return the parameters that θ does not separate, in words."""
     return "; ".join(
         f"{group[0]} has no effect"

@@ -188,11 +188,11 @@ class PartitionQR:
             e = basis.left(rows.y - known, q, self.coordinates)
             r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
             seen = SecondQR(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
-            found = seen if found is None else _both(found, seen)
+            found = seen if found is None else _join_factors(found, seen)
         return found
 
 
-def _both(one: SecondQR, other: SecondQR) -> SecondQR:
+def _join_factors(one: SecondQR, other: SecondQR) -> SecondQR:
     return SecondQR(
         _triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom
     )
@@ -320,7 +320,7 @@ class StreamedProblem(Problem):
         return (
             alone
             if isinstance(alone, StreamedProblem)
-            else streamed(alone, self.source, self.passes)
+            else stream_problem(alone, self.source, self.passes)
         )
 
     def weighed(self, weight: OutputWeights) -> Problem:
@@ -353,13 +353,13 @@ def pose_streamed(
     """
     require = options.pop("require_full_rank", True)
     seen = pose(record, baseline, *args, **options, require_full_rank=False)
-    found = streamed(seen, source, passes)
+    found = stream_problem(seen, source, passes)
     if require:
         require_rank(found.excitation, found.count * len(found.outputs))
     return found
 
 
-def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
+def stream_problem(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     """Return the problem of a source, from the problem of a subsample of it."""
     empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
     form = Form(seen.baseline, seen.features, seen.layout, empty)
@@ -392,7 +392,7 @@ def _factorise(
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _both)
+    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _join_factors)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)

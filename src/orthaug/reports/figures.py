@@ -65,7 +65,7 @@ def plot(
     check_type(path, str | os.PathLike | None, "path", "a file's name")
     if path is not None and Path(path).suffix.lower() != ".png":
         raise InputError(f"{path}: figures are written as PNG; give a name that ends in .png.")
-    figure = _drawn(what, kind, title)
+    figure = _draw(what, kind, title)
     if path is not None:
         from orthaug.reports import plots
 
@@ -76,7 +76,7 @@ def plot(
     return figure
 
 
-def _drawn(what: Any, kind: str, title: str | None) -> Figure:
+def _draw(what: Any, kind: str, title: str | None) -> Figure:
     from orthaug.reports import finding_plots, linear_plots, plots
 
     if isinstance(what, Linearization):

@@ -86,7 +86,7 @@ class LearnedPart:
     ) -> LearnedPart:
         """Return the learned part of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
-        chosen = spread(len(states))
+        chosen = spread_indices(len(states))
         points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
 
         def at(x: Matrix) -> Matrix:
@@ -121,7 +121,7 @@ class LearnedPart:
         rows = np.concatenate(
             [form.regressors(experiment, record) for experiment in record.experiments]
         )
-        points = rows[spread(len(rows))]
+        points = rows[spread_indices(len(rows))]
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
         features = tuple(str(entry) for entry in form.features.entries)
@@ -228,7 +228,7 @@ class LearnedPart:
             batch = max(len(self.points), _BATCH)  # of as many there is a program
             found = [self.at(rows[start : start + batch]) for start in range(0, len(rows), batch)]
             learned = np.concatenate(found).reshape(size, size, -1)
-            near = np.repeat(np.repeat(_near(cells), _FINER, axis=0), _FINER, axis=1)
+            near = np.repeat(np.repeat(_cells_near_data(cells), _FINER, axis=0), _FINER, axis=1)
             learned = np.where(near[..., None], learned, np.nan)
         else:
             learned = _mean_in_cells(cells, self.values, count)
@@ -252,7 +252,7 @@ def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | 
     )
 
 
-def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
+def _cells_near_data(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
     """Return the cells with data, and those beside them."""
     there = np.zeros((_CELLS + 2, _CELLS + 2), dtype=bool)
     for i in (0, 1, 2):
@@ -268,7 +268,7 @@ def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.nda
     return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)
 
 
-def spread(count: int, most: int = _MOST_POINTS) -> np.ndarray:
+def spread_indices(count: int, most: int = _MOST_POINTS) -> np.ndarray:
     """Return at most so many indices, spread evenly over `count`."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug.selection.forward import Equations, spanned
+from orthaug.selection.forward import Equations, spanned_columns
 from orthaug.selection.term_runs import Able, Point, TermRuns
 
 MOVED, SPANNED = "physics_moved", "terms_within_span"
@@ -134,7 +134,7 @@ def kept_physics(
         )
         for i, p in enumerate(physics.parameters)
     )
-    within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
+    within = spanned_columns(every, columns, runs.collinear, runs.constant) if columns else []
     terms = dict(zip((texts[i] for i in chosen.chosen), map(float, left[nt:]), strict=True))
     return PhysicsComparison(shifts, terms, condition, len(within), len(texts), runs.collinear)
 

@@ -68,7 +68,7 @@ class Parts:
     intervals: Intervals
 
 
-def parted(
+def split_record(
     record: Record, baseline: Baseline, lags: int, *, by: str | None = None, least: int = FEWEST
 ) -> Parts:
     """Cut a record into the part that chooses and the one that is fitted.

@@ -40,7 +40,7 @@ def rivals(runs: TermRuns, point: Point) -> dict[str, tuple[str, ...]]:
         if std is None or abs(point.w[place]) < reach(freedom) * std:
             continue
         others = [column for column in known if column != nt + i]
-        gram, left = _beside(hessian, right, others)
+        gram, left = _project_out(hessian, right, others)
         gains, kept = _gains_with_each(gram, left, nt + i)
         able = [k for k in np.flatnonzero(kept < least) if k not in known]
         able.sort(key=lambda k: -gains[k])
@@ -49,7 +49,7 @@ def rivals(runs: TermRuns, point: Point) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _beside(hessian: Matrix, right: Vector, known: list[int]) -> tuple[Matrix, Vector]:
+def _project_out(hessian: Matrix, right: Vector, known: list[int]) -> tuple[Matrix, Vector]:
     """Return the equations with some columns projected out."""
     across = hessian[:, known] @ np.linalg.pinv(
         hessian[np.ix_(known, known)], rcond=1e-12, hermitian=True

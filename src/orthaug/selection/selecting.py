@@ -22,7 +22,7 @@ from orthaug.data.regressors import Lags, in_order
 from orthaug.data.terms import CONSTANT
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.held_out import blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP, Learner
 from orthaug.models.rows import Engine, InMemory
@@ -44,7 +44,7 @@ from orthaug.selection.parts import (
     Intervals,
     Parts,
     of_parts,
-    parted,
+    split_record,
 )
 from orthaug.selection.rivals import rivals
 from orthaug.selection.term_path import (
@@ -102,7 +102,7 @@ def search_learners(
     tried += [
         replace(learner, hidden=(width,), inputs=inputs) for inputs in seen for width in widths
     ]
-    folds = blocked(record, blocks, max(problem.first_row, _largest(lags)))
+    folds = held_out_blocks(record, blocks, max(problem.first_row, _largest_order(lags)))
     names = (
         tuple(channel.name for channel in record.outputs),
         tuple(channel.name for channel in record.inputs),
@@ -132,7 +132,7 @@ def search_learners(
     return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
 
 
-def _largest(lags: Lags) -> int:
+def _largest_order(lags: Lags) -> int:
     nb, nk = (np.atleast_1d(part) for part in (lags.nb, lags.nk))
     return int(max(np.max(lags.na, initial=0), np.max(nb + nk - 1, initial=0)))
 
@@ -247,7 +247,7 @@ class Selection:
         if self.terms is not None:
             chosen, texts = self.terms.chosen.point.chosen, self.terms.runs.library.texts
             return Terms(tuple(texts[i] for i in chosen)) if chosen else None
-        linear = _beside(self.orders, self.record, self.baseline)
+        linear = _linear_texts(self.orders, self.record, self.baseline)
         return Terms(tuple(linear)) if linear else None
 
     @cached_property
@@ -477,7 +477,7 @@ def select(
     layout = partial(_layout, problem.outputs, names)
     asked = _with_every_input(orders.chosen, largest)
     tested = nonlinearity(problem, [str(lag) for lag in layout(asked)]) if layout(asked) else None
-    reach = _reached(orders.chosen, asked, tested, names)
+    reach = _orders_with_inputs(orders.chosen, asked, tested, names)
     search = _Search(problem, criterion, largest, blocks, collinear, level, heard, runner)
     path, found, physics, notes = search.beyond(learner, orders, reach, tested, widths, most)
     if heard.stopped:
@@ -499,7 +499,7 @@ def select(
         heard.stopped,
     )
     selection = Selection(*chosen, physics, reach, parts.intervals, level)
-    return _noted(selection, whole if fitted is None else fitted)
+    return _add_notes(selection, whole if fitted is None else fitted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -539,7 +539,7 @@ class _Search:
         runs, notes, considered = _terms(problem, learner, self.largest, criterion, self.collinear)
         near = [baseline.lags, _layout(problem.outputs, names, reach)]
         linear, at_most = (
-            _beside(orders, problem.record, baseline),
+            _linear_texts(orders, problem.record, baseline),
             min(most, len(problem.rows) // 10),
         )
         control = Control(self.level, considered) if self.level < 1 else None
@@ -569,7 +569,7 @@ def _parts(
     network: bool,
 ) -> Parts:
     """Return the rows that choose and those that are fitted."""
-    lags = _lagged(largest)
+    lags = _lag_count(largest)
     if isinstance(halves, Parts):
         return halves
     if fitted is not None:
@@ -577,29 +577,29 @@ def _parts(
             record, fitted, of_parts(sum(max(len(e) - lags, 0) for e in fitted.experiments))
         )
     if halves:
-        return parted(record, baseline, lags, least=1)
+        return split_record(record, baseline, lags, least=1)
     if network:
         return Parts(record, record, CONDITIONAL)
     if halves is not None:
         return Parts(record, record, Intervals.none("`halves` is false"))
     try:
-        return parted(record, baseline, lags)
+        return split_record(record, baseline, lags)
     except InputError as error:
         return Parts(record, record, Intervals.none(str(error)))
 
 
 def lagged_rows(problem: Problem, lags: Lags | None) -> int:
     """Return the number of leading rows of an experiment that are lags, for the largest orders."""
-    return _lagged(_reach(problem, lags)[0])
+    return _lag_count(_reach(problem, lags)[0])
 
 
-def _lagged(largest: Orders) -> int:
+def _lag_count(largest: Orders) -> int:
     return max(
         [largest.na, *(nk + nb - 1 for nk, nb in zip(largest.nk, largest.nb, strict=True) if nb)]
     )
 
 
-def _noted(found: Selection, declared: Record) -> Selection:
+def _add_notes(found: Selection, declared: Record) -> Selection:
     """Return the selection with what is to be said of its intervals.
 
     Of all rows where nothing was chosen.
@@ -652,7 +652,7 @@ def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tu
     return Lags(orders.na, orders.nb, orders.nk).layout(outputs, inputs)
 
 
-def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
+def _linear_texts(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
     """Return the linear lags of the choice, and its constant, that the physics does not have."""
     outputs, inputs = (
         [channel.name for channel in group] for group in (record.outputs, record.inputs)
@@ -675,7 +675,7 @@ def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
     return replace(chosen, nb=nb, nk=nk)
 
 
-def _reached(
+def _orders_with_inputs(
     chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
 ) -> Orders:
     """Return the chosen orders with the inputs that have only a nonlinear effect."""

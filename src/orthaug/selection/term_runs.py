@@ -269,7 +269,7 @@ class TermRuns:
             [point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))]
         )
         states = point.states if point.states is not None else np.asarray(self.layout.start)
-        trial = _descended(objective, p, Start(states), iterations)
+        trial = _descend(objective, p, Start(states), iterations)
         loss = (
             trial.misfit * self.rms**2 / self.layout.count if np.isfinite(trial.misfit) else np.inf
         )
@@ -373,7 +373,7 @@ class TermRuns:
         return mean if mean < RUNAWAY * float(self.problem.deviation[0]) ** 2 else np.inf
 
 
-def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
+def _descend(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
     """Minimise the misfit by Gauss-Newton steps, with Levenberg-Marquardt where one fails.
 
     About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was

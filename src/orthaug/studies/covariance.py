@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug.inference.covariance import joint_covariance
-from orthaug.studies.common import Drawing, Finding, Reproduction, panels, trained
+from orthaug.studies.common import Drawing, Finding, Reproduction, panels, train
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
 
@@ -25,7 +25,7 @@ def one(seed: int, pipeline: str) -> dict[str, Any]:
 
     "pseudo" is P̂ with the pseudo-inverse of the weights' block, which is singular to rounding.
     """
-    fit = trained(static(1, noise=True), "static", pipeline, seed=seed)
+    fit = train(static(1, noise=True), "static", pipeline, seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
     pseudo = np.abs(joint_covariance(fit.problem, fit.model, "paper", own_units=True)) * len(
         fit.problem.rows

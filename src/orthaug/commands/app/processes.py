@@ -170,7 +170,7 @@ class WorkerPool:
             self._busy.add(process)
             answer: dict[str, Any] = {"last": True}
             try:
-                answer = await _answered(process, {"question": question, **given})
+                answer = await _ask_worker(process, {"question": question, **given})
             finally:
                 self._busy.discard(process)
                 if answer["last"]:
@@ -185,7 +185,7 @@ class WorkerPool:
     def prepare(self) -> None:
         """Start a process that waits for the next question."""
         if self._coming is None and not self._idle:
-            self._coming = asyncio.ensure_future(_started())
+            self._coming = asyncio.ensure_future(_start_worker())
 
     async def _taken(self) -> asyncio.subprocess.Process:
         while self._idle:
@@ -194,7 +194,7 @@ class WorkerPool:
                 return process
         coming, self._coming = self._coming, None
         if coming is None or (coming.done() and coming.exception()):  # or it could not start then
-            coming = asyncio.ensure_future(_started())
+            coming = asyncio.ensure_future(_start_worker())
         try:
             return await asyncio.shield(coming)
         except asyncio.CancelledError:
@@ -214,7 +214,7 @@ class WorkerPool:
                 await asyncio.wait_for(process.wait(), _GRACE)
 
 
-async def _started() -> asyncio.subprocess.Process:
+async def _start_worker() -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "orthaug.commands.app.worker"),
         stdin=asyncio.subprocess.PIPE,
@@ -225,7 +225,7 @@ async def _started() -> asyncio.subprocess.Process:
     )
 
 
-async def _answered(
+async def _ask_worker(
     process: asyncio.subprocess.Process, question: dict[str, Any]
 ) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None

@@ -423,7 +423,7 @@ class Session:
         if what in single and (self.folder / single[what]).is_file():
             return self.folder / single[what]
         if what in folders and (self.folder / folders[what]).is_dir():
-            return _zipped(self.folder / folders[what], self.folder / f"download-{what}")
+            return _zip_folder(self.folder / folders[what], self.folder / f"download-{what}")
         raise InputError("there is nothing of that name yet.")
 
     async def close(self) -> None:
@@ -475,7 +475,7 @@ def _as_name(text: str) -> str:
     return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 
-def _zipped(folder: Path, place: Path) -> Path:
+def _zip_folder(folder: Path, place: Path) -> Path:
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(folder.rglob("*")):
             if file.is_file():

@@ -20,7 +20,7 @@ from orthaug.commands.app.widgets import (
     choice,
     curves_figure,
     field,
-    named,
+    label_widget,
     note,
     plot,
     redrawn,
@@ -303,17 +303,19 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with named(
+        with label_widget(
             ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"
         ):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
                     for own in fields(STEPS[kind]) if kind in STEPS else ():
-                        usual = "all" if own.name == "channels" else spec_text.shown(own.default)
+                        usual = (
+                            "all" if own.name == "channels" else spec_text.field_text(own.default)
+                        )
                         field(
                             _LABELS.get(own.name, own.name),
-                            spec_text.shown(step.get(own.name)),
+                            spec_text.field_text(step.get(own.name)),
                             partial(
                                 self.session.edit,
                                 "steps",
@@ -326,7 +328,7 @@ class DataView:
                             hint="" if own.default is MISSING else usual,
                         )
             remove = partial(self.session.edit, "more steps", spec_text.without_row, _STEPS, index)
-            named(button("Remove", remove), f"Remove step {index + 1}")
+            label_widget(button("Remove", remove), f"Remove step {index + 1}")
 
     def _add(self) -> None:
         kind = self.kind

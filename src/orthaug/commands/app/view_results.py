@@ -15,8 +15,8 @@ from orthaug.commands.app.widgets import (
     card,
     choice,
     field,
+    label_widget,
     link,
-    named,
     note,
     redrawn,
     text,
@@ -175,7 +175,7 @@ class ExportView:
                 if why == "":
                     made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = named(
+                    made = label_widget(
                         button("Write", partial(session.export, target, self.name)),
                         f"Write {target}",
                     )

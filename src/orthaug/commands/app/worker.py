@@ -160,7 +160,7 @@ def _curves(found: Survey) -> dict[str, Any]:
         time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
         if time is None or len(time) < len(values) or not np.isfinite(time).all():
             time = step * np.arange(len(values))
-        curves[column.header] = thinned(time, values)
+        curves[column.header] = thin_curve(time, values)
     return curves
 
 
@@ -243,7 +243,9 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
         for e in record.experiments:
             values = np.hstack([e.inputs, e.outputs])[:, j]
             share = max(8, MOST * len(e) // max(len(record), 1))
-            curve = thinned(e.start_time + record.sampling_time * np.arange(len(e)), values, share)
+            curve = thin_curve(
+                e.start_time + record.sampling_time * np.arange(len(e)), values, share
+            )
             x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
         curves[channel.name] = {
             "x": x[:-1],
@@ -254,7 +256,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
     return curves
 
 
-def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
+def thin_curve(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
     """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:

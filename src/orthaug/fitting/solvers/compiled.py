@@ -190,7 +190,9 @@ def minimise(
     """
     options, start, state = settings.prepared(w)
     state = (
-        _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
+        _first_state(w, linearise(criterion, w, arguments, overlap), start)
+        if state is None
+        else state
     )
     if settings.runs(state):  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
@@ -208,7 +210,7 @@ def minimise(
     return settings.ended(state, training_clock() - began, enough=enough)
 
 
-def driven(
+def minimise_by_engine(
     normal_at: Callable[[Any, Overlap], Normal],
     w: Float[Array, "nw"],
     overlap: Overlap,
@@ -225,7 +227,7 @@ def driven(
     first = normal_at(w, overlap) if state is None else None  # compiles: no time of the run
     began = training_clock()
     if first is not None:
-        state = _begun(
+        state = _first_state(
             w, normal_at(w, first.overlap), start
         )  # less what rounding left of J in the physics
     assert state is not None
@@ -244,7 +246,7 @@ def burst_length(burst: int, spent: float) -> int:
 
 
 @jax.jit
-def _begun(w: Any, normal: Normal, ridge: Any) -> State:
+def _first_state(w: Any, normal: Normal, ridge: Any) -> State:
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
     return State(
@@ -257,7 +259,7 @@ def _begun(w: Any, normal: Normal, ridge: Any) -> State:
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
         code=jnp.where(
-            finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE
+            finite, jnp.where(is_spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE
         ),
         mark=normal.loss,
     )
@@ -395,7 +397,7 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
     return jnp.sum(jnp.where(values > floor, values / (values + alpha), 0.0))
 
 
-def spanned(normal: Normal) -> Any:
+def is_spanned(normal: Normal) -> Any:
     """Return whether P⊥J = 0: the learner lies in the span of the physics (Example 1)."""
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     return curvature <= _NOTHING_LEFT * _largest_column(normal)

@@ -92,7 +92,7 @@ class LevenbergMarquardt:
         **options: Any,
     ) -> TrainingRun:
         """Minimise the same pass by pass, for rows elsewhere; see `compiled.driven`."""
-        return compiled.driven(normal_at, w, overlap, self._settings(**options))
+        return compiled.minimise_by_engine(normal_at, w, overlap, self._settings(**options))
 
     def descend(
         self,
