@@ -308,7 +308,7 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
         "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
     )
     job = open_job(tmp_path / "spec.toml")
-    runs = job.planned(AS_DECLARED)
+    runs = job.plan_of(AS_DECLARED)
     assert [tuple(run.values()) for run in runs] == [
         *(
             ("orthogonal", 1, "none"),
@@ -317,10 +317,10 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             ("orthogonal", 2, "ard"),
         )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+    assert len(runs) == job.run_count and job.plan_of(Variant(PHYSICS_ONLY)) == (
         {"structure": PHYSICS_ONLY},
     )
-    penalised = job.planned(Variant("baseline-penalty"))
+    penalised = job.plan_of(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
     monkeypatch.setattr("orthaug.commands.bars._OFTEN", 0.0)
@@ -392,7 +392,7 @@ def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path,
     monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)
     monkeypatch.setattr(page.model, "follow_data", lambda: seen.append("model"))
     monkeypatch.setattr(page.training, "follow_work", lambda: seen.append("training"))
-    session.changed("data")
+    session.mark_changed("data")
     page.follow()
     assert [type(error) for error in told] == [ZeroDivisionError] and seen == ["model", "training"]
     page.follow()
@@ -608,7 +608,10 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     assert session.found is not None and session.data is not None
     assert view._whole_file()[0] == "motor_test.csv"  # nothing was checked yet
     view._take_uses(session.found)
-    assert view.uses == {"left": "input", "right": "output"} and view._lacking(session.found) == []
+    assert (
+        view.uses == {"left": "input", "right": "output"}
+        and view._missing_columns(session.found) == []
+    )
     session.checked = {"files": [str(session.folder / "motor_train.csv")]}
     assert view._whole_file() == (
         "motor_train.csv",
@@ -616,13 +619,13 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     )
     session.raw.clear()
     assert view._whole_file() == ("", {})
-    assert export._beside() == ["motor_train.csv"]
+    assert export._uploaded_files() == ["motor_train.csv"]
     session.spec = spec_text.with_value(
         session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]}
     )
-    assert export._beside() == ["motor_train.csv", "motor_test.csv"]
+    assert export._uploaded_files() == ["motor_train.csv", "motor_test.csv"]
     session.spec = session.spec.replace('"left"', '"up"')
-    assert view._lacking(session.found) == ["up"]
+    assert view._missing_columns(session.found) == ["up"]
     view._drawn = (None, None, False)
     view._take_uses(session.found)
     assert view.uses == {"left": "", "right": ""}

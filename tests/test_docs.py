@@ -214,7 +214,7 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
     spec.write_text(
         re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE)
     )
-    with LEARNERS.added("polynomial", polynomial):
+    with LEARNERS.with_kind("polynomial", polynomial):
         assert load_spec(spec).declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
     with pytest.raises(

@@ -66,7 +66,7 @@ def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarr
 
     @jax.jit
     def states(made: Numbers, start, inputs):
-        made = form.prepared(made)
+        made = form.prepare(made)
         return jax.lax.scan(lambda x, row: (form.step(made, x, row)[0], x), start, inputs)[1]
 
     return np.asarray(states(made, np.asarray(start), inputs))

@@ -368,7 +368,9 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     assert model.predict(record).scores().rmse[0] < 1.5 * 0.002 + 0.002
     (trajectory,) = free.trajectories
     np.testing.assert_allclose(trajectory.baseline + trajectory.learner, trajectory.model)
-    alone = model.alone.simulate(record, initial=record.experiments[0].outputs).trajectories[0]
+    alone = model.physics_only.simulate(record, initial=record.experiments[0].outputs).trajectories[
+        0
+    ]
     assert np.abs(trajectory.learner).max() > 0.01 and alone.learner.any() == False  # noqa: E712  (an array)
     zero = model.simulate(
         oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero"

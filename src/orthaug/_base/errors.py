@@ -28,7 +28,7 @@ def visible(text: str) -> str:
     )
 
 
-def value_text(value: Any) -> str:
+def show(value: Any) -> str:
     """Return a value as Python writes it, on one line, cut where it is long."""
     try:
         if math.prod(getattr(value, "shape", ())) > _FEW:

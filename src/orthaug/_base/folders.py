@@ -54,14 +54,14 @@ class Partials:
     def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
         """Return a new folder in `parent`; `made` are the parents that vanish with it."""
         with self.lock:
-            partial = self._named(parent, made)
+            partial = self._name_file(parent, made)
             partial.mkdir()
             return partial
 
     def file(self, parent: Path) -> Path:
         """Return a new empty file in `parent`."""
         with self.lock:
-            partial = self._named(parent, ())
+            partial = self._name_file(parent, ())
             partial.touch(exist_ok=False)
             return partial
 
@@ -102,7 +102,7 @@ class Partials:
         for partial in list(self._open):
             self.discard(partial)
 
-    def _named(self, parent: Path, made: Sequence[Path]) -> Path:
+    def _name_file(self, parent: Path, made: Sequence[Path]) -> Path:
         if parent not in self._swept:
             remove_stale(parent, self._open)
             self._swept.add(parent)

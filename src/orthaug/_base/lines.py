@@ -22,7 +22,7 @@ def fit_screen(columns: int) -> None:
     _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
-def count_text(number: int, thing: str) -> str:
+def plural(number: int, thing: str) -> str:
     """Return `1 sample`, `2 samples`."""
     return f"{number} {thing}" + ("" if number == 1 else "s")
 

@@ -154,7 +154,7 @@ class Registry(Mapping[str, Any]):
         del self._entries[kind]
 
     @contextmanager
-    def added(self, kind: str, declaration: type) -> Iterator[None]:
+    def with_kind(self, kind: str, declaration: type) -> Iterator[None]:
         """Register a declaration inside a `with` block only."""
         self.add(kind, declaration)
         try:

@@ -317,8 +317,12 @@ def _candidates(
             saturations([entry.suspect for entry in others]), certify=False, every=False
         )
         likely = [
-            Candidate(entry.suspect.name, explains(entry), _theta_shift(entry) + bias - _theta_shift(cause),
-                      entry.suspect in suspects)
+            Candidate(
+                entry.suspect.name,
+                explains(entry),
+                _theta_shift(entry) + bias - _theta_shift(cause),
+                entry.suspect in suspects,
+            )
             for entry in others
             if entry.explained
             and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)

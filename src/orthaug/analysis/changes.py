@@ -247,10 +247,10 @@ class Candidates:
             piece = Experiment(piece.inputs, ran)
         columns = self._columns(piece, record)
         if self.measured:
-            carried = self._carried(np.concatenate([columns, error], axis=2), piece, record)
+            carried = self._carry_through(np.concatenate([columns, error], axis=2), piece, record)
             columns, error = carried[:, :, :-1], carried[:, :, -1:]
         elif self.simulates:
-            columns = self._carried(columns, piece, record)
+            columns = self._carry_through(columns, piece, record)
         error, scaled = (
             error[skip:, :, 0] / problem.deviation,
             columns[skip:] / problem.deviation[:, None],
@@ -289,7 +289,7 @@ class Candidates:
         }
         return np.array([means[lag.channel] for lag in self.lags])
 
-    def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
+    def _carry_through(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
         """Return the columns carried through the free run, from a start independent of them."""
         form, first, ny = self.fit.model.form, self.first, columns.shape[1]
         states = form.start(piece.outputs, np.arange(first, len(piece)))

@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import count_text, percent
+from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.inconsistency import inconsistency
@@ -368,7 +368,7 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{count_text(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
+            f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
             f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
             'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )

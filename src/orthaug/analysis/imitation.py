@@ -99,7 +99,8 @@ class Imitation:
         ]
         if self.determined:
             sentences.append(
-                f"The fit determines {_list_words(self.determined)} beside any learner of these inputs."
+                f"The fit determines {_list_words(self.determined)} "
+                "beside any learner of these inputs."
             )
         if self.physical:
             sentences.append(
@@ -169,7 +170,7 @@ def imitation(
         held: parameters at a bound.
     """
     slopes = _slopes(problem, physics)
-    own = problem.shared.leaving([problem.baseline.names.index(name) for name in held])
+    own = problem.shared.without_entries([problem.baseline.names.index(name) for name in held])
     inputs = tuple(str(entry) for entry in problem.features.entries)
     alternatives = []
     for other in other_inputs(problem) if others and not problem.features.linear else ():

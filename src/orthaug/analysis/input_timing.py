@@ -103,7 +103,7 @@ def on_longest(
     """
     longest = max(problem.record.experiments, key=len)
     record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
-    return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+    return MotionTask.of(problem.on(record), learner, criterion).prepare(solver, structure)
 
 
 def _try_hold(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
@@ -131,7 +131,7 @@ def refit_physics(
     segmented = SegmentedMotion.of(
         replace(plan.problem, motion=motion, record=record), None, plan.criterion
     )
-    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(
+    segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps).from_states(
         free_fit.end.point.states
     )
     again = segmented.descend(

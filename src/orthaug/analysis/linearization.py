@@ -239,7 +239,7 @@ def _system(
         ne, root = len(point.rest), spread.root
         change = np.asarray(unrest_along(step, numbers, point.rest, point.inputs, unknowns, root))
         rows = [*range(ne), *(ne + i for i in point.slopes.outputs)]
-        along = point.slopes.following(change[rows])
+        along = point.slopes.follow(change[rows])
         moved = np.asarray(
             slope_along(
                 step,

@@ -76,7 +76,7 @@ class MeasureLinearization:
             learned=self.learned,
             certify=certify,
             directions=self.directions,
-            absorbed=None if self.directions is None else self._absorbed(chosen),
+            absorbed=None if self.directions is None else self._absorbed_effects(chosen),
         )
 
     def without(self, entry: SuspectedBias) -> MeasureLinearization:
@@ -84,13 +84,13 @@ class MeasureLinearization:
         held = (
             entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
             if self.directions is None
-            else self._absorbed([entry.suspect])[0].held
+            else self._absorbed_effects([entry.suspect])[0].held
         )
         return replace(
             self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
         )
 
-    def _absorbed(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
+    def _absorbed_effects(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
         problem = self.problem
         layout, outputs = problem.layout, problem.outputs
 

@@ -64,7 +64,7 @@ def _slopes(
     inputs: Float[Array, "nu m"],
 ) -> Any:
     """Return ∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
 
 

@@ -117,7 +117,7 @@ def families_of(linearization: MotionLinearization) -> list[TermBias]:
     terms = motion_catalogue(
         motion, motion.coordinates.physical(linearization.q), field.x, field.u, on
     )
-    entries = [linearization.seen_entry(term) for term in terms if linearization.sees(term)]
+    entries = [linearization.entry_without_run(term) for term in terms if linearization.sees(term)]
     return [
         entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
     ]
@@ -128,10 +128,9 @@ def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> floa
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(linearization.learned_beside() ** 2)
+    own = np.sum(linearization.unshared_learner() ** 2)
     return float(
-        np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2)
-        / max(own, np.finfo(float).tiny)
+        np.sum(linearization.weigh(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny)
     )
 
 
@@ -295,7 +294,7 @@ def one_of_each(
         return []
     values = (
         *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
-        linearization.learned_beside(),
+        linearization.unshared_learner(),
     )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)

@@ -151,7 +151,7 @@ def _run(
     inputs: Float[Array, "T nu m"],
 ) -> tuple[Float[Array, "T ny m"], Float[Array, "T ny n m"]]:
     """Return outputs of every run, and their sensitivities to start and coordinates."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
 
     def step(carry: Any, row: Any) -> Any:
         state, slopes = carry

@@ -52,7 +52,7 @@ def identify_ranks(segmented: SegmentedMotion) -> RankReport | None:
 
     None where no run is finite.
     """
-    segmented = segmented.alone
+    segmented = segmented.physics_only
     steps = segmented.segments.steps
     for shorter_runs in (
         segmented,
@@ -116,7 +116,7 @@ def ill_conditioned_alone(task: MotionTask) -> list[Warning]:
 
     None where it has no run.
     """
-    free_fit, segmented = task.physics, task.plan.alone
+    free_fit, segmented = task.physics, task.plan.physics_only
     if free_fit is None or not free_fit.ending.usable:
         return []
     q = free_fit.end.point.theta

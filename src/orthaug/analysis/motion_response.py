@@ -118,7 +118,11 @@ class TermsResponse:
         None where it has none.
         """
         own = self.information[self.parameters + k, self.parameters + k]
-        return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
+        return (
+            float(np.sqrt(np.clip(1 - self._remaining_information(k)[1] / own, 0.0, 1.0)))
+            if own > 0
+            else None
+        )
 
     def size(self, k: int) -> float:
         """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
@@ -133,7 +137,7 @@ class TermsResponse:
 
         None where the fit could hold the term as well.
         """
-        row, left = self._beside(k)
+        row, left = self._remaining_information(k)
         if not left > ALIKE * self.information[self.parameters + k, self.parameters + k]:
             return None
         pulled = np.zeros(len(row))
@@ -166,7 +170,7 @@ class TermsResponse:
         made = (self.form, self.numbers, place.segmented.segments, place.states, place.weight)
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
-    def _beside(self, k: int) -> tuple[Vector, float]:
+    def _remaining_information(self, k: int) -> tuple[Vector, float]:
         """Return the row (n,) that removes the fit from the term, and the remaining information."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
@@ -259,7 +263,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     ):
         return None
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    finer = segmented.refined(2 * substeps)
+    finer = segmented.with_substeps(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
     moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
     slopes = sensitivity(

@@ -156,7 +156,7 @@ def usual_places(motion: Motion) -> tuple[int, ...]:
 
 def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
     """Raise InputError for suspects that the motion cannot have, or without a value somewhere."""
-    motion, (x, u) = problem.motion, problem.looked_at
+    motion, (x, u) = problem.motion, problem.guessed_points
     check_unique((suspect.name for suspect in suspects), "suspect")
     for suspect in suspects:
         suspect.place(motion)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug.analysis.observed import Observations, ObserverRun
 from orthaug.analysis.observer_noise import by_verdict, most_likely, of_fit
 from orthaug.data.record import Experiment, Record
@@ -109,10 +109,10 @@ class Observer:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
         """
         record = self._record(record)
-        runs = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
+        runs = tuple(self._run_along(experiment, record)[0] for experiment in record.experiments)
         form = self.model.filtering[0]
         names = form.names if form.hidden else ()
-        return Observations(runs, self.model.outputs, names, record.sampling_time, self._settled)
+        return Observations(runs, self.model.outputs, names, record.sampling_time, self._start_rows)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Return the prediction of each row from `horizon` samples before it, with its deviation.
@@ -126,12 +126,12 @@ class Observer:
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)
         trajectories = [
-            self._ahead(experiment, record, horizon) for experiment in record.experiments
+            self._predict_ahead(experiment, record, horizon) for experiment in record.experiments
         ]
         return Response(tuple(trajectories), horizon, self.model.outputs, record.sampling_time)
 
     @property
-    def _settled(self) -> int:
+    def _start_rows(self) -> int:
         """Rows that determine the start of an experiment."""
         form = self.model.filtering[0]
         return self.model.window if form.hidden else form.first_row
@@ -139,7 +139,7 @@ class Observer:
     def _record(self, record: Record) -> Record:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
-    def _along(
+    def _run_along(
         self, experiment: Experiment, record: Record
     ) -> tuple[ObserverRun, StateEstimate, Matrix]:
         """Return the observed run of an experiment, the predicted states, and the steps' inputs."""
@@ -160,14 +160,14 @@ class Observer:
             )
         return _fill_unestimated(rows, experiment, first), before, inputs
 
-    def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
+    def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         form, numbers, _ = self.model.filtering
-        first = max(form.first_row, min(self._settled, len(experiment) - horizon)) + horizon - 1
+        first = max(form.first_row, min(self._start_rows, len(experiment) - horizon)) + horizon - 1
         self.model.check_rows(experiment, first)
-        _, before, inputs = self._along(experiment, record)
+        _, before, inputs = self._run_along(experiment, record)
         parts, std = predict_outputs(form, numbers, self.noise, before, inputs, horizon)
         if form.hidden:
-            alone = self.model.alone.filtering
+            alone = self.model.physics_only.filtering
             known = parts
             if self.model.form.bound is not None:
                 known = predict_outputs(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
@@ -283,9 +283,7 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     try:
         row = np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"`{name}` must be a vector of numbers; got {value_text(values)}."
-        ) from None
+        raise InputError(f"`{name}` must be a vector of numbers; got {show(values)}.") from None
     if row.shape != (count,):
         raise InputError(f"`{name}` must have {count} numbers; got the shape {row.shape}.")
     if np.isinf(row).any() or (not gaps and np.isnan(row).any()):
@@ -321,7 +319,7 @@ def _check_noise(noise: Any, disturbances: int, outputs: int) -> Noise:
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
         raise InputError(
-            f"`noise` must be an oa.Noise(state, output) of two covariances; got {value_text(noise)}."
+            f"`noise` must be an oa.Noise(state, output) of two covariances; got {show(noise)}."
         )
     parts = []
     for (name, size), given in zip(sizes.items(), noise, strict=True):

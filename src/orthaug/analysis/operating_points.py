@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, is_number, nearest
-from orthaug._base.errors import InputError, Warning, value_text
+from orthaug._base.errors import InputError, Warning, show
 from orthaug.analysis.linear_steps import Step, at_rest, difference_widths, sizes_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
@@ -41,7 +41,7 @@ class Slopes:
     outputs: tuple[int, ...]
     """Numbers of the outputs whose values are equations too."""
 
-    def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
+    def follow(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
         """Return the change of (rest, inputs) by changed equations (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
@@ -89,11 +89,11 @@ def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
         at = given
     wanted = 'names with finite numbers, such as "force=0, position=1"'
     if not isinstance(at, Mapping):
-        raise InputError(f"the operating point must be {wanted}; got {value_text(at)}.")
+        raise InputError(f"the operating point must be {wanted}; got {show(at)}.")
     for name, value in at.items():
         if not isinstance(name, str) or not name or not is_number(value):
             raise InputError(
-                f"the operating point must be {wanted}; got {value_text(name)} = {value_text(value)}."
+                f"the operating point must be {wanted}; got {show(name)} = {show(value)}."
             )
     return {name: float(value) for name, value in at.items()}
 
@@ -149,7 +149,7 @@ class Search:
                 known = list(dict.fromkeys((*step.inputs, *step.rest, *outputs)))
                 hint = nearest(name, known)
                 raise InputError(
-                    f"the model has no '{value_text(name)[1:-1]}'{hint}; known are {', '.join(known)}."
+                    f"the model has no '{show(name)[1:-1]}'{hint}; known are {', '.join(known)}."
                 )
         ne = len(step.rest)
         trims = bool(wanted) or bool(np.isfinite(given[:ne]).any())

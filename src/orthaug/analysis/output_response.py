@@ -123,7 +123,7 @@ def _linearise_run(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
     """
 
     def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
-        own = form.prepared(numbers._replace(theta=theta))
+        own = form.prepare(numbers._replace(theta=theta))
         following, parts = form.step(own, state, row)
         return following, parts.total
 

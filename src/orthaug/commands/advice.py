@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug._base.lines import count_text
+from orthaug._base.lines import plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.suspects import Suspect
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
@@ -433,14 +433,14 @@ class Trials:
     substeps: int | None = None
     """Substeps of a motion that is integrated."""
 
-    def changed(self, change: dict[str, Any]) -> Job:
+    def changed_job(self, change: dict[str, Any]) -> Job:
         """Return the job of a changed spec, with the substeps of the fit: a search would cost most.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
         fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
-        return self.job.changed(
+        return self.job.with_spec(
             spec_model().model_validate(apply_change(self.job.declaration, change | fixed))
         )
 
@@ -463,7 +463,7 @@ class Trials:
     def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
         """Return the trial of a proposal."""
         try:
-            job = self.changed(proposal.change)
+            job = self.changed_job(proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return ProposalErrors(proposal, None)
@@ -506,7 +506,7 @@ def advise(
     motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
-    base = trials.run(trials.changed({}), variant)
+    base = trials.run(trials.changed_job({}), variant)
     if base is None:
         return None
     chosen = found[: _MOST if motion is None else _MOST_OF_A_MOTION]
@@ -540,7 +540,7 @@ def _conclude_trials(
         f"run over {rows.where}"
     )
     text += (
-        f"{rows.which}: {count_text(len(tried), 'change')} of the spec, "
+        f"{rows.which}: {plural(len(tried), 'change')} of the spec, "
         f"{_relative_clause(len(helps), len(tried))}."
     )
     if worse:
@@ -548,7 +548,9 @@ def _conclude_trials(
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
-        text += f" {count_text(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        text += (
+            f" {plural(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+        )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 

@@ -69,7 +69,7 @@ def parts_of(
     if network and not halves:
         return Parts(record, record, CONDITIONAL)
     if halves is False:
-        return Parts(record, record, Intervals.none("`selection.halves` is false"))
+        return Parts(record, record, Intervals.empty("`selection.halves` is false"))
     files, ranges = expand_files(path, section.files, "train"), Rows.of((), section.rows).ranges
     fault = _not_cut(job, len(files) * max(len(ranges), 1))
     by = None
@@ -82,7 +82,7 @@ def parts_of(
     except InputError as error:
         if halves:
             raise InputError(f"{path}: 'selection.halves': {error}.") from None
-        return Parts(record, record, Intervals.none(str(error)))
+        return Parts(record, record, Intervals.empty(str(error)))
 
 
 def _not_cut(job: LaggedJob, expected: int) -> str:

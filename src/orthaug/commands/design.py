@@ -73,7 +73,7 @@ def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> De
     spec, motion = job.spec, job.problem.motion
     task = MotionTask.of(without_learner(job.problem), None, spec.declared_criterion())
     solver: Any = spec.declared_solver()
-    task = task.prepared(solver, job.structure)
+    task = task.prepare(solver, job.structure)
     if task.physics is None:
         raise InputError(
             "physics alone has no finite free run from its initial values; give others."

@@ -205,7 +205,7 @@ def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
     """Train a variant of a job and score every part; `judge_fit` judges the learner."""
-    progress.planned(job.planned(variant))
+    progress.planned(job.plan_of(variant))
     return report_of(job, job.run(variant, progress))
 
 

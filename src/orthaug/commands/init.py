@@ -12,7 +12,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
-from orthaug._base.lines import count_text, percent
+from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import relative
 from orthaug.data.columns import Column
 from orthaug.data.headers import is_time
@@ -78,7 +78,7 @@ def step_of(found: Survey, roles: Roles) -> float:
 
 def gap_text(rows: int) -> str:
     """Return the number of rows that lack a value, in words."""
-    return f"{count_text(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
+    return f"{plural(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
 
 
 def spec_text(
@@ -369,7 +369,7 @@ def _join(names: Names | None) -> str | None:
 
 def _no_output_reason(found: Survey, inputs: str | None) -> str:
     """Return the reason why no column is left for an output."""
-    rows = count_text(max(column.filled for column in found.columns), "row")
+    rows = plural(max(column.filled for column in found.columns), "row")
     others = list_unused(found, [*found.signals])
     if not found.signals:
         return (
@@ -415,7 +415,7 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
-        f"{count_text(lost, 'training row')} in longer runs of wild samples "
+        f"{plural(lost, 'training row')} in longer runs of wild samples "
         f"{'is' if lost == 1 else 'are'} left out"
     )
     gaps = gap_text(missing) if missing else wild if lost else ""
@@ -570,13 +570,13 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     )
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
-        text += f"; {count_text(column.missing, 'cell')} missing"
+        text += f"; {plural(column.missing, 'cell')} missing"
     if spikes and column.spikes:
-        text += f"; {count_text(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
-    for value, count in column.limits:
         text += (
-            f"; {count_text(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
+            f"; {plural(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
         )
+    for value, count in column.limits:
+        text += f"; {plural(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
         moves = (
             f", while it moves by {column.movement:.2g} from row to row"

@@ -42,7 +42,7 @@ _NOT_ANALYSED = Warning(
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
 
-def checked(job: LaggedJob) -> CheckResult:
+def check(job: LaggedJob) -> CheckResult:
     """Return excitation of the data, identifiability of the physics, and bias by suspects."""
     problem = job.problem
     return CheckResult.model_validate(
@@ -67,7 +67,7 @@ def checked(job: LaggedJob) -> CheckResult:
     )
 
 
-def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
+def refusal(job: LaggedJob, result: CheckResult) -> InputError | None:
     """Return the reason why the job cannot be fitted, after the report; None where it can."""
     try:
         require_rank(job.problem.excitation, job.problem.samples)
@@ -189,7 +189,7 @@ def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
     """Return the free run of every part by the model's physics without its learner."""
-    alone = fit.model.alone
+    alone = fit.model.physics_only
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 

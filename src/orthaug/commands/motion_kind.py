@@ -41,7 +41,7 @@ _NOT_RICH = Warning(
 )
 
 
-def checked(job: MotionJob) -> CheckResult:
+def check(job: MotionJob) -> CheckResult:
     """Return identifiability, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
@@ -136,7 +136,7 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
-def refused(job: MotionJob, result: CheckResult) -> InputError | None:
+def refusal(job: MotionJob, result: CheckResult) -> InputError | None:
     """Return an error where the outputs do not identify the parameters, after the report."""
     found = result.excitation
     if found.rank == found.columns:

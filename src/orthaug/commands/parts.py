@@ -10,7 +10,7 @@ from typing import Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest
-from orthaug._base.lines import count_text
+from orthaug._base.lines import plural
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
@@ -111,7 +111,7 @@ def long_stretches(
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
             f"{record.experiments[0].source}: {what}the longest stretch between missing "
-            f"samples has {count_text(most, 'row')}, too few: {needed}."
+            f"samples has {plural(most, 'row')}, too few: {needed}."
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)
@@ -120,7 +120,7 @@ def long_stretches(
     )
     return kept, (
         f"{record.missing} {lost} left out with all windows that touch them; "
-        f"{count_text(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
+        f"{plural(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
     )
 
 

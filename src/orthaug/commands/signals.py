@@ -69,7 +69,7 @@ class SignalWatch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def reporting(
+    def report_stop(
         self, during: Callable[[], str], stop: Callable[[], Any] = _no_text, then: str = ""
     ) -> Iterator[None]:
         """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""
@@ -81,7 +81,7 @@ class SignalWatch:
             self._then = ""
 
     @contextmanager
-    def asking(self) -> Iterator[threading.Event]:
+    def ask_to_stop(self) -> Iterator[threading.Event]:
         """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
         A second one ends the program.

@@ -54,7 +54,7 @@ def declared_terms(
         InputError: an unknown kind, equation or name, an expression that cannot be read or has no
             value.
     """
-    suspects, (x, u) = [], problem.looked_at
+    suspects, (x, u) = [], problem.guessed_points
     for section in sections:
         kept = ("factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import nearest
-from orthaug._base.errors import LONGEST, InputError, value_text
+from orthaug._base.errors import LONGEST, InputError, show
 
 
 class Lag(NamedTuple):
@@ -189,7 +189,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     """
     constants = dict(constants or {})
     if not isinstance(text, str):
-        raise InputError(f"an expression must be text such as 'y[k-1]'; got {value_text(text)}.")
+        raise InputError(f"an expression must be text such as 'y[k-1]'; got {show(text)}.")
     text = " ".join(text.split())
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
@@ -235,7 +235,7 @@ def parse_named(
     """
     if not isinstance(text, str):
         raise InputError(
-            f"{where} must be an expression in text such as 'Ts**2 / m'; got {value_text(text)}."
+            f"{where} must be an expression in text such as 'Ts**2 / m'; got {show(text)}."
         )
     if "[" in text:
         raise InputError(
@@ -293,7 +293,7 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
     """Walk the tree once; raise InputError at the first node that is not on the list."""
     if isinstance(node, ast.Constant):
         if isinstance(node.value, bool) or not isinstance(node.value, int | float):
-            raise InputError(f"'{text}': {value_text(node.value)} is not a number.")
+            raise InputError(f"'{text}': {show(node.value)} is not a number.")
         try:
             finite = math.isfinite(float(node.value))
         except OverflowError:

@@ -19,7 +19,7 @@ from xml.etree.ElementTree import iterparse
 
 import numpy as np
 
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.memory import check_memory
 
 _REMARK = ("#", "%")  # lines above the header that begin so
@@ -405,7 +405,7 @@ def _check_order(path: Path, sheet: Any) -> None:
                 before, row, column = row, int(element.get("r", row + 1)), 0
                 if not before < row <= _ROWS:
                     raise InputError(
-                        f"{path}: the rows of the sheet are out of order at row {value_text(row)}."
+                        f"{path}: the rows of the sheet are out of order at row {show(row)}."
                     )
             elif event == "start" and kind == "c":
                 place = element.get("r")

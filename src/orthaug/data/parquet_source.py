@@ -314,7 +314,7 @@ def _look(
             else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
         )
         found.add(instants, None if experiment is None else _numbers(batch, experiment))
-    return found.ended()
+    return found.end_scan()
 
 
 class _BatchScan:
@@ -397,7 +397,7 @@ class _BatchScan:
         if inside.sum() >= _FEWEST_STEPS:
             self.rates.append(float(np.nanmean(steps)))
 
-    def ended(self) -> tuple[Runs, float | None]:
+    def end_scan(self) -> tuple[Runs, float | None]:
         ranges = tuple(zip(self.begins, [*self.begins[1:], self.rows], strict=True))
         if self.time is None:
             return Runs(ranges, (0.0,) * len(ranges)), None

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
-from orthaug._base.errors import InputError, MissingSampleError, value_text
-from orthaug._base.lines import count_text
+from orthaug._base.errors import InputError, MissingSampleError, show
+from orthaug._base.lines import plural
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
 from orthaug.data.layouts import text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
@@ -117,7 +117,7 @@ def read_record(
     if prepare:
         return _RawRanges(
             table, channels, column_of, time, sampling_time or 1.0, every, missing
-        ).prepared(prepare, ranges)
+        ).prepare(prepare, ranges)
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
@@ -167,7 +167,7 @@ class _RawRanges:
     every: int
     missing: str
 
-    def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
+    def prepare(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
         """Return the record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
@@ -178,7 +178,7 @@ class _RawRanges:
         )
         if lost and self.missing == "error":
             lacking = (
-                f"{count_text(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
+                f"{plural(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
                 "preparation"
             )
             raise MissingSampleError(
@@ -287,7 +287,7 @@ def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, s
     for name, column in given.items():
         if not isinstance(column, str):
             raise InputError(
-                f"`columns`: the column of {value_text(name)} must be a name; got {value_text(column)}."
+                f"`columns`: the column of {show(name)} must be a name; got {show(column)}."
             )
     return {c.name: given.get(c.name, c.file_column) for group in channels for c in group}
 
@@ -328,7 +328,7 @@ def _ranges(
     ):
         raise InputError(
             f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such "
-            f"pairs; got {value_text(rows)}."
+            f"pairs; got {show(rows)}."
         )
     for pair in pairs:
         if len(pair) != 2 or not 0 <= pair[0] < pair[1]:

@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 
 from orthaug._base.checks import Matrix, Vector, check_number, check_type, nearest
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.registry import OneOf, check_fields
 
 _MAD = 1.4826  # standard deviations of a normal variable in its median absolute deviation
@@ -60,7 +60,7 @@ class Run:
                 )
         return [self.names.index(name) for name in channels]
 
-    def holding(self, columns: list[int], values: Matrix) -> Run:
+    def with_values(self, columns: list[int], values: Matrix) -> Run:
         """Return the experiment with other values in some columns."""
         changed = self.values.copy()
         changed[:, columns] = values
@@ -107,7 +107,7 @@ class Detrend:
         check_fields(self)
         if self.degree > 1:
             raise InputError(
-                f"`degree` must be 0, the mean, or 1, a straight line; got {value_text(self.degree)}."
+                f"`degree` must be 0, the mean, or 1, a straight line; got {show(self.degree)}."
             )
 
     def apply(self, run: Run) -> Run:
@@ -117,7 +117,7 @@ class Detrend:
             there = np.isfinite(values[:, j])
             if there.sum() > self.degree:
                 values[:, j] -= np.polyval(np.polyfit(t[there], values[there, j], self.degree), t)
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class Outliers:
         values = run.values[:, columns].copy()
         for x in values.T:
             x[self._wild(x)] = np.nan
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
     def _wild(self, x: Vector) -> np.ndarray:
         distance, deviation = self.distances(x)
@@ -295,7 +295,7 @@ class Fill:
             for a, b in zip(there[:-1], there[1:], strict=True):
                 if 1 < b - a <= self.most + 1:
                     x[a + 1 : b] = guess[a + 1 : b]
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ class Shift:
     def __post_init__(self) -> None:
         check_type(self.channel, str, "channel", "an input's name")
         if isinstance(self.samples, bool) or not isinstance(self.samples, int):
-            raise InputError(f"`samples` must be a whole number; got {value_text(self.samples)}.")
+            raise InputError(f"`samples` must be a whole number; got {show(self.samples)}.")
 
     def apply(self, run: Run) -> Run:
         if self.channel not in run.names[: run.inputs]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.lines import count_text, percent
+from orthaug._base.lines import percent, plural
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -235,7 +235,7 @@ def _frozen_warnings(record: Record) -> list[Warning]:
                 continue
             text = (
                 f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
-                f"{count_text(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
+                f"{plural(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
                 "and changes from row to row elsewhere: a sensor or a recorder was frozen. "
                 "Leave these rows out (`rows` of the data)."
             )

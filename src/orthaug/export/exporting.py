@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug import __version__
 from orthaug._base.checks import check_type, nearest
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug._base.jax import jax
 from orthaug.export.kinds import TARGETS, VECTORS, Target
@@ -56,7 +56,7 @@ def check_target(to: str) -> str:
     """
     if not isinstance(to, str) or to not in TARGETS:
         hint = nearest(to, TARGETS) if isinstance(to, str) else ""
-        raise InputError(f"no export to {value_text(to)}{hint}; known are {', '.join(TARGETS)}.")
+        raise InputError(f"no export to {show(to)}{hint}; known are {', '.join(TARGETS)}.")
     return to
 
 
@@ -70,7 +70,7 @@ def check_export(to: str, folder: Path, name: str = "model", *, force: bool = Fa
     )
     if not plain or keyword.iskeyword(name) or name in _TAKEN:
         raise InputError(
-            f"{value_text(name)} cannot name the exported code; use ASCII letters, digits and "
+            f"{show(name)} cannot name the exported code; use ASCII letters, digits and "
             f"underscores, at most {_LONGEST}, starting with a letter, and no word of a "
             "language or library."
         )

@@ -83,7 +83,7 @@ class FadeNodes:
         """Names of the intermediate results for a reader, numbered from 1 like the features."""
         return {key: _read(key) for key, _ in self.locals}
 
-    def faded(self, correction: Node) -> Node:
+    def fade(self, correction: Node) -> Node:
         """Return a correction multiplied by the factor of fading."""
         return correction if self.share is None else apply("mul", self.share, correction)
 
@@ -176,7 +176,7 @@ def _lower_lagged(model: Model, name: str, digest: str) -> Program:
         network = _network(form.bound, numbers, seen, np.arange(len(form.outputs)))
         for i, summands in enumerate(sums):
             correction = total([Entry("g", i), *corrections[i]])
-            summands.append(correction if held is None else held.faded(correction))
+            summands.append(correction if held is None else held.fade(correction))
     block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
@@ -259,7 +259,7 @@ def _with_correction(
     if rows:
         physics, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
-    return apply("add", physics, correction if held is None else held.faded(correction))
+    return apply("add", physics, correction if held is None else held.fade(correction))
 
 
 def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:

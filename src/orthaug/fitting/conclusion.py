@@ -216,7 +216,7 @@ def _beside_the_learner(
     middle = _middle(problem, learned, problem.weight.covariance(whitened))
     if gram is None or middle is None:
         return None
-    factor, taken = problem.projection, eliminate(structure, problem).taken_beside(fixed)
+    factor, taken = problem.projection, eliminate(structure, problem).taken_with_fixed(fixed)
     nt = len(taken)
     overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
     k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])

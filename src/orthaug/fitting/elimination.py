@@ -76,11 +76,11 @@ class Elimination:
         """True where θ is independent of the learner, and the learner of bounds (F1)."""
         return not self._learner({}).any()
 
-    def taken_beside(self, fixed: Fixed) -> Matrix:
+    def taken_with_fixed(self, fixed: Fixed) -> Matrix:
         """Return P (nθ, nθ) where some entries of θ are at a bound."""
         if not fixed or self.shared is None:
             return self.taken
-        basis = np.linalg.qr(self.to_coordinates @ self.shared.leaving(fixed).basis)[0]
+        basis = np.linalg.qr(self.to_coordinates @ self.shared.without_entries(fixed).basis)[0]
         return basis @ basis.T
 
     @property
@@ -89,7 +89,7 @@ class Elimination:
 
     def _learner(self, fixed: Fixed) -> Matrix:
         return np.concatenate(
-            [np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner]
+            [np.eye(len(self.outputs)) - self.taken_with_fixed(fixed), self.rows.learner]
         )
 
     @property
@@ -155,7 +155,7 @@ class Elimination:
             },
         )
 
-    def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
+    def settle(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
         """Return the entries at a bound where training with the same entries fixed ended.
 
         Those of physics alone at first.
@@ -226,7 +226,7 @@ def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()
         fixed: entries of θ at a bound, which no direction moves.
     """
     shared = _shared_directions(structure, problem)
-    return None if shared.all else shared.leaving(fixed).basis
+    return None if shared.all else shared.without_entries(fixed).basis
 
 
 class ThetaSplit(NamedTuple):
@@ -266,7 +266,7 @@ def split_theta(
             i: value for i, value in enumerate(inside) if value != reached[i]
         }
     fixed = elimination.active(share) if fixed is None else fixed
-    taken = elimination.taken_beside(fixed) @ share
+    taken = elimination.taken_with_fixed(fixed) @ share
     aux = factor.from_coordinates(taken)
     if elimination.shared is not None:
         aux[list(fixed)] = 0.0  # but for rounding it is

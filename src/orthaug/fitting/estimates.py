@@ -335,7 +335,7 @@ class Estimate(AnyFit):
             slope = self._slope()
             covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
-        covariance = self._grown(covariance, self.model.statistics)
+        covariance = self._enlarge(covariance, self.model.statistics)
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
 
     def _hc3(self) -> Estimate:
@@ -363,7 +363,7 @@ class Estimate(AnyFit):
         return replace(
             self,
             model=replace(self.model, statistics=own),
-            covariance=self._grown(self._cov_along(own, self._slope()), own),
+            covariance=self._enlarge(self._cov_along(own, self._slope()), own),
             plain_covariance=self.covariance
             if self.plain_covariance is None
             else self.plain_covariance,
@@ -371,7 +371,7 @@ class Estimate(AnyFit):
             std_kind="hc3",
         )
 
-    def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
+    def _enlarge(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
         """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
         return enlarge_covariance(
             covariance, statistics, None if self.model.shared is None else self.problem.shared

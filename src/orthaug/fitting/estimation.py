@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
-from orthaug._base.errors import InputError, Warning, value_text
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
@@ -72,7 +72,7 @@ def reweight(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) ->
         )
         if change <= _SETTLED:
             return replace(estimate, restarts=first.restarts)
-        problem = problem.weighed(weight)
+        problem = problem.weigh(weight)
         estimate = again(problem, estimate)
     text = (
         f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
@@ -476,7 +476,7 @@ def _warm_start(
             f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
         )
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    problem = problem.seen_linearly() if model.form.features.linear else problem
+    problem = problem.for_linear_learner() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
     return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
@@ -516,10 +516,10 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
             raise InputError(
                 "`regularization` must be auto, none, evidence, ard or a number; got "
-                f"{value_text(choice)}."
+                f"{show(choice)}."
             )
         elif not (is_number(choice) and choice >= 0):
-            raise InputError(f"`regularization` must be 0 or more; got {value_text(choice)}.")
+            raise InputError(f"`regularization` must be 0 or more; got {show(choice)}.")
     if not choices:
         raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
     return auto

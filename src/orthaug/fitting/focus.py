@@ -233,8 +233,8 @@ class _FocusChoice:
         pieces: dict[Key, list[Any]] = {key: [] for key in keys}
         for training, held in records:
             whole = training is self.problem.record
-            made = {} if whole else {ONE_STEP: self._made(training, Prediction()),
-                                     FREE_RUN: self._made(training, self.free_run)}  # fmt: skip
+            criteria = {} if whole else {ONE_STEP: Prediction(), FREE_RUN: self.free_run}
+            made = {key: self._quick_fit(training, one) for key, one in criteria.items()}
             for key, found in pieces.items():
                 one = self.estimate(key) if whole else _drop_learner(made[key[0]], key[1])
                 found += _errors(one, held, self.problem)
@@ -252,7 +252,7 @@ class _FocusChoice:
         except InputError:
             return [(self.problem.record, self.problem.record)]
 
-    def _made(self, training: Record, criterion: Any) -> Any:
+    def _quick_fit(self, training: Record, criterion: Any) -> Any:
         try:
             return self.fit(self.problem.on(training), criterion=criterion, **_quick(self.options))
         except InputError:  # the block took away what the physics needs

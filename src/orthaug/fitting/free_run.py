@@ -57,7 +57,7 @@ def train_physics_only(
     lengthen. Of all ends the best over whole experiments is kept; where a start was better than
     them, whole experiments are trained on too.
     """
-    plan = plan.alone
+    plan = plan.physics_only
     objective = plan.objective(structure)
     least_squares, initial = objective.begin(np.zeros(0)), plan.problem.baseline.initial
     starts = [
@@ -171,7 +171,7 @@ class FreeRunTask(SimulationTask):
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
         plan = SegmentedStreamed if isinstance(task.problem, StreamedProblem) else SegmentedLagged
-        return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
+        return cls(plan.of(task, criterion), None, warm).with_checkpoints(task.checkpoints)
 
     @property
     def rows_task(self) -> OneStepTask:
@@ -184,7 +184,7 @@ class FreeRunTask(SimulationTask):
         """
         if self.physics is None:
             return self.rows_task.physics_alone()
-        plan = self.plan.alone
+        plan = self.plan.physics_only
         return plan.task, replace(self, plan=plan).learned(self.physics)
 
     def on(self, record: Record) -> FreeRunTask:

@@ -95,7 +95,7 @@ def fit_motion(
     check_solver(solver, criterion, () if learner is None else choices)
     engine = runs_on(engine) if restarts * len(choices) > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
-    task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
+    task = MotionTask.of(problem, learner, criterion, engine).with_checkpoints(kept)
     starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     retry = isinstance(regularization, str) and regularization == "auto"
     chosen = Choice(validation, blocks, fallback, retry=retry)
@@ -149,7 +149,7 @@ def conclude_motion(
         defect=None,
         problem=task.problem,
         criterion=task.criterion,
-        split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
+        split_by=MotionSplit.empty("training", plan.dynamics, learned.coefficients),
         segmented=plan,
         states=states,
         slope=slope,
@@ -289,7 +289,7 @@ def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
-    segmented = SegmentedMotion.of(problem, form.bound, criterion).refined(form.substeps)
+    segmented = SegmentedMotion.of(problem, form.bound, criterion).with_substeps(form.substeps)
     centre, half = (
         (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
     )
@@ -317,7 +317,7 @@ def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
         defect=None,
         problem=problem,
         criterion=criterion,
-        split_by=MotionSplit.none(model.measure, form, c),
+        split_by=MotionSplit.empty(model.measure, form, c),
         segmented=segmented,
         states=kept.states,
         slope=kept.slope,

@@ -118,7 +118,7 @@ def _sum_over(
     q: Float[Array, "np"],
     size: Float[Array, "nl"],
 ) -> Float[Array, "np n0+n m"]:
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
     def mixed_derivative(x: Any, row: Any) -> Any:

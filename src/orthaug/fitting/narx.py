@@ -150,7 +150,7 @@ class AugmentedNARX(Augmented):
         Raises:
             InputError (a ValueError): other columns than in the fit, too short an experiment.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         y = self._outputs(y, len(X))
         found = np.full(y.shape, np.nan)
@@ -174,7 +174,7 @@ class AugmentedNARX(Augmented):
             InputError (a ValueError): other columns than in the fit, too short an experiment or
                 `initial`.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         found = np.full((len(X), len(self.output_names_)), np.nan)
         whole = initial is not None and np.ndim(initial) > 0 and len(initial) == len(X)

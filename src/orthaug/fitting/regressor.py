@@ -119,7 +119,7 @@ class AugmentedRegressor(Augmented):
             InputError (a ValueError): other columns than in the fit, values that are not finite, an
                 expression without a value on a row; standard errors of a fit that has none.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         nothing = np.zeros((len(X), len(self.output_names_)))
         record = Record.from_arrays(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from orthaug._base.checks import check_count
-from orthaug._base.errors import InputError, KeyedError, value_text
+from orthaug._base.errors import InputError, KeyedError, show
 from orthaug._base.memory import check_limit, check_memory, in_words
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS, Solver
@@ -36,10 +36,10 @@ def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> t
 def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
     """Raise InputError for seeds that are too large, or an ensemble of one."""
     if seed + restarts >= 2**63:
-        words = f": found {value_text(seed)}; expected seeds below 2**63 for all restarts"
-        raise KeyedError(f"`seed` must be below 2**63; got {value_text(seed)}.", "seed", words)
+        words = f": found {show(seed)}; expected seeds below 2**63 for all restarts"
+        raise KeyedError(f"`seed` must be below 2**63; got {show(seed)}.", "seed", words)
     if ensemble and restarts < 2:
-        words = f": found {value_text(restarts)}; expected 2 or more for an ensemble"
+        words = f": found {show(restarts)}; expected 2 or more for an ensemble"
         raise KeyedError(
             "an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words
         )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from orthaug._base.checks import check_count, nearest
-from orthaug._base.errors import InputError, TrainingError, value_text
+from orthaug._base.errors import InputError, TrainingError, show
 from orthaug._base.jax import jax
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
 from orthaug.data.record import Record
@@ -113,7 +113,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def coef_table_(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        return self._fitted().parameters
+        return self._fitted_estimate().parameters
 
     @property
     def noise_std_(self) -> np.ndarray | None:
@@ -121,7 +121,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         None where no degrees of freedom are left.
         """
-        noise = self._fitted().model.statistics.noise
+        noise = self._fitted_estimate().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
 
     def set_params(self, **params: Any) -> Any:
@@ -146,7 +146,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 
-    def _fitted(self) -> Estimate:
+    def _fitted_estimate(self) -> Estimate:
         """Return the estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
 
@@ -300,7 +300,7 @@ def baseline_of(
         raise InputError(
             "`physics` must be 'linear', a list of expressions or Terms, a mapping of "
             "parameters to expressions, a Baseline, or a function of a row; got "
-            f"{value_text(physics)}."
+            f"{show(physics)}."
         )
     for term in physics:
         _check_columns(term.regressor, names)

@@ -220,7 +220,7 @@ class SegmentedProblem:
             "flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT
         )
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
+    def end_in_memory(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Return the end of a run with segments in memory; it has a derivative."""
         assert end.linear is not None
         return TrialInMemory(objective, end.point, objective.slope(end.linear.start))

@@ -105,7 +105,7 @@ class SegmentedStreamed(SegmentedLagged):
             )
         return mean if mean < RUNAWAY else np.nan
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
+    def end_in_memory(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Return the segments of the subsample.
 
         Where that is all rows, with the states that were trained.
@@ -190,7 +190,7 @@ def _advance_rows(
     rows: Any,
 ) -> tuple[Any, Any]:
     """Return the state after some rows, and the squares (ny,) of the scored errors."""
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
 
     def step(carry: Any, row: Any) -> tuple[Any, None]:
         state, squares = carry

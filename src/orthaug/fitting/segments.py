@@ -112,7 +112,7 @@ def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
     """Return outputs of every segment from its state."""
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     return jax.lax.map(
         lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs)
     )
@@ -155,7 +155,7 @@ def sensitivity(
 
     Rows are multiplied by `weight`.
     """
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     n = dynamics.unknowns
 
     def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
@@ -283,7 +283,7 @@ def block_scores(
     Args:
         place: the block of each step, the same in every segment.
     """
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     _, n0, width = segments.start.shape
     n = dynamics.unknowns
 

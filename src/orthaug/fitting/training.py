@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
-from orthaug._base.lines import count_text
+from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
@@ -124,7 +124,7 @@ def train(
         conclude: makes the estimate of a task, a structure and what a run learned.
     """
     with one_blas_thread():
-        task = task.prepared(solver, structure, partial(progress, 0))
+        task = task.prepare(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
     planned, (starts, runs) = (
         len(starts),
@@ -318,7 +318,7 @@ def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> 
 def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
     if not count:
         return []
-    text = f"training was stopped on request: {count} of {count_text(runs, 'run')} had not ended"
+    text = f"training was stopped on request: {count} of {plural(runs, 'run')} had not ended"
     text += ", and none was tried on held-out blocks" if untried else ""
     return [
         Warning(
@@ -378,7 +378,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
     try:
-        own = task.on(training).prepared(solver, structure)
+        own = task.on(training).prepare(solver, structure)
         fits = [_conclude_physics(conclude, own, structure)]
         for start in starts:
             report()

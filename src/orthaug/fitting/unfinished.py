@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from orthaug._base.errors import Warning
-from orthaug._base.lines import count_text, percent
+from orthaug._base.lines import percent, plural
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.limit import Tail, noticeable_in
@@ -61,7 +61,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
     """Return the warning that there are no intervals, with cause and remedy."""
     assert learned.tail is not None
     text = (
-        f"no intervals: training ended after {count_text(learned.tail.done, 'iteration')} while "
+        f"no intervals: training ended after {plural(learned.tail.done, 'iteration')} while "
         f"the loss still fell ({_fall(learned.tail)}), so the parameters may still move by "
         "more than their standard errors. "
     )
@@ -90,17 +90,17 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
         return ""
     words = ""
     if ending is Ending.RUNNING and tail.limit:
-        words = f"training stopped at its limit of {count_text(tail.done, 'iteration')}"
+        words = f"training stopped at its limit of {plural(tail.done, 'iteration')}"
         words += f" while the loss was still falling ({_fall(tail)}); the model is usable, "
         words += "more iterations may improve it"
         if not tail.noticeable:
             words = (
-                f"training stopped at its limit of {count_text(tail.done, 'iteration')}, and the "
+                f"training stopped at its limit of {plural(tail.done, 'iteration')}, and the "
                 f"loss hardly fell any more ({_fall(tail)})"
             )
     if tail.prolonged:
         past = (
-            f"training went on past its limit of {count_text(tail.limit, 'iteration')}, because "
+            f"training went on past its limit of {plural(tail.limit, 'iteration')}, because "
             "the loss still fell"
         )
         words = f"{past}; {words or ending.message}".rstrip("; ")

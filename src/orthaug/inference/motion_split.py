@@ -75,7 +75,7 @@ class MotionSplit:
     support: float = 1.0
 
     @classmethod
-    def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
+    def empty(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
         """Return the split before any: c itself, nothing shared, over no points."""
         nothing = Field(
             np.zeros((0, form.states)),

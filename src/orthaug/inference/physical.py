@@ -248,7 +248,10 @@ def solve(
     if outside:
         warnings.append(_outside(fit, value))
     elif not sensitivity.full_rank:
-        text = f"At the solution {tied_text(sensitivity)}; the physical parameters have no standard errors."
+        text = (
+            f"At the solution {tied_text(sensitivity)}; "
+            "the physical parameters have no standard errors."
+        )
         warnings.append(Warning("physical_parameters_tied", text))
     if not fit.known:
         text = "theta has no finite covariance, so the physical parameters have no standard errors."

@@ -84,19 +84,19 @@ class Dask(Threads):
             task = partial(
                 _build_chunks, row_builder=row_builder, size=self.limit
             )  # not scattered: what is lost can be made again
-            return [self._on(task, partition) for partition in source.partitions]
+            return [self._task_on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
-            return self._added(
+            return self._add_sums(
                 [
                     self.client.submit(_partial_sum, function, part, given, pure=False)
                     for part in rows
                 ]
             )
 
-    def _added(self, parts: list[Any]) -> Any:
+    def _add_sums(self, parts: list[Any]) -> Any:
         """Return the sum of partial sums, in their order."""
         while len(parts) > 1:
             groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
@@ -129,7 +129,10 @@ class Dask(Threads):
     ) -> ClusterChunks:
         with cluster_errors():
             return ClusterChunks(
-                [self._on(partial(_chunk_list, function), partition) for partition in partitions],
+                [
+                    self._task_on(partial(_chunk_list, function), partition)
+                    for partition in partitions
+                ],
                 tuple(counts),
             )
 
@@ -158,7 +161,7 @@ class Dask(Threads):
             kept, parts = (
                 [self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1)
             )
-            return ClusterChunks(kept, rows.counts), self._added(parts)
+            return ClusterChunks(kept, rows.counts), self._add_sums(parts)
 
     def fetch(self, rows: ClusterChunks) -> Any:
         with cluster_errors():
@@ -169,13 +172,15 @@ class Dask(Threads):
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """Return a function of every partition, where the workers are."""
         with cluster_errors():
-            return self.client.gather([self._on(function, partition) for partition in partitions])
+            return self.client.gather(
+                [self._task_on(function, partition) for partition in partitions]
+            )
 
     def room(self) -> Room:
         """Return the room of the smallest worker, which may add up a whole branch of the tree."""
         return smallest_worker(self.client, _BRANCHES + 1)
 
-    def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
+    def _task_on(self, function: Callable[[Any], Any], partition: Any) -> Any:
         """Return a task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
         if not held:

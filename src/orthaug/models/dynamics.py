@@ -35,7 +35,7 @@ class Numbers(NamedTuple):
     each; None otherwise.
     """
     scheme: Any = None
-    """Results of `Dynamics.prepared` for all steps of a run."""
+    """Results of `Dynamics.prepare` for all steps of a run."""
     limits: Any = None
     """(2, nz), the range of the features over the training rows; None for a learner that goes on as
     it is beyond it.
@@ -51,7 +51,7 @@ class Numbers(NamedTuple):
         return self if self.limits is None else self._replace(limits=None, pull=None)
 
     @property
-    def alone(self) -> Numbers:
+    def physics_only(self) -> Numbers:
         """The numbers of the physics, in the shapes of a fit without a learner.
 
         Programs of such a fit can then be used again.
@@ -165,7 +165,7 @@ class Dynamics(Protocol):
         """Return a state and the inputs of a step by the names that a user knows."""
         ...
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with all that the steps of a run share, computed once."""
         ...
 
@@ -225,7 +225,7 @@ class AutodiffDynamics:
 
     differentiable = True
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
 
     def scaled_features(

@@ -146,9 +146,9 @@ class MotionFilter:
         return self.form.states
 
     @property
-    def alone(self) -> MotionFilter:
+    def physics_only(self) -> MotionFilter:
         """The filter of the motion without its learner."""
-        return MotionFilter(self.form.alone)
+        return MotionFilter(self.form.physics_only)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return self.form.inputs(experiment, record)

@@ -98,7 +98,7 @@ def advance(
         field: ẋ = F(x, u).
         scheme: the `Exponentials` of its linear part; None for `rk4`.
         x: the state.
-        row: the input as `held` arranges it.
+        row: the input as `inputs_at_points` arranges it.
         nu: number of inputs.
         step: the sampling time.
         substeps: of a sample.

@@ -38,7 +38,7 @@ class Lagged:
     bound: Bound | None
 
     @property
-    def alone(self) -> Lagged:
+    def physics_only(self) -> Lagged:
         """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 
@@ -171,7 +171,7 @@ class Lagged:
         raw = _learned_output(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 

@@ -18,7 +18,7 @@ from annotated_types import Ge
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.models.beyond import BEYOND
@@ -95,7 +95,7 @@ class MLP:
         if not isinstance(self.hidden, tuple | list):
             raise InputError(
                 "`hidden` must be a tuple of neurons per layer, such as (16,); got "
-                f"{value_text(self.hidden)}."
+                f"{show(self.hidden)}."
             )
         if isinstance(self.inputs, str):
             raise InputError(
@@ -105,7 +105,7 @@ class MLP:
         if not isinstance(self.inputs, list | tuple | None) or any(
             not isinstance(i, str) for i in self.inputs or ()
         ):
-            got = value_text(self.inputs)
+            got = show(self.inputs)
             raise InputError(
                 f"`inputs` must be a tuple of expressions, or None for all lags; got {got}."
             )
@@ -113,7 +113,7 @@ class MLP:
         object.__setattr__(self, "inputs", None if self.inputs is None else tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
             raise InputError(
-                f"`hidden` must be whole numbers of neurons, 1 or more; got {value_text(self.hidden)}."
+                f"`hidden` must be whole numbers of neurons, 1 or more; got {show(self.hidden)}."
             )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"

@@ -120,9 +120,12 @@ class Model(RecordModel, NotebookView):
         return self.form.baseline.parameters, self.theta
 
     @property
-    def alone(self) -> Model:
+    def physics_only(self) -> Model:
         """The model without its learner."""
-        return replace(self, form=self.form.alone, numbers=self.numbers.alone)
+        return replace(self, form=self.form.physics_only, numbers=self.numbers.physics_only)
+
+    alone = physics_only
+    """Earlier name of `physics_only`."""
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """Return f, before any split, at regressors of the form's layout, in the outputs' units.

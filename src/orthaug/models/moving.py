@@ -174,7 +174,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return layout_of(self.motion)
 
     @property
-    def alone(self) -> MotionDynamics:
+    def physics_only(self) -> MotionDynamics:
         """These dynamics without the learner."""
         return replace(self, features=(), bound=None)
 
@@ -206,7 +206,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         return _step(self, numbers, state, inputs)
 
-    def _stepped(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def _step_once(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         y = self.observed(numbers, state, self.now(inputs))
         parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
         if self.motion.integrator == "discrete":
@@ -225,7 +225,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         )
         return following, parts
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with the exponentials of an exact integrator.
 
         Their derivatives are by the coordinates of p.
@@ -310,7 +310,7 @@ def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tu
 
     It is traced once, whatever programs contain it; so is the field in it.
     """
-    return form._stepped(numbers, state, inputs)
+    return form._step_once(numbers, state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")

@@ -34,7 +34,7 @@ class Windows(NamedTuple):
     scored: Any
     """Inputs of each window, (T, m)."""
 
-    def padded(self) -> tuple[Windows, int]:
+    def pad(self) -> tuple[Windows, int]:
         """Return longer and more windows on the device, and T.
 
         Few shapes have programs of their own.
@@ -77,7 +77,7 @@ def settle(
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / np.asarray(loose, dtype=float) ** 2
-    layout = windows.padded()  # once for all iterations
+    layout = windows.pad()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearise_windows(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
@@ -147,7 +147,7 @@ def _gram(
 
     The sums are over the first `steps` of the windows.
     """
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     n0, m = states.shape
     directions = jnp.eye(n0)
 

@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_arrays
 
 from orthaug import __version__
 from orthaug._base.checks import check_type, is_number
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
 from orthaug.models import lagged_storage, motion_storage
@@ -44,13 +44,12 @@ def check_loaded(model: Any, path: Path) -> None:
     """
     if not is_number(model.sampling_time) or model.sampling_time <= 0:
         raise InputError(
-            f"{path}: its sampling time is {value_text(model.sampling_time)}; expected a positive "
-            "number."
+            f"{path}: its sampling time is {show(model.sampling_time)}; expected a positive number."
         )
     for name in ("structure", "measure", "time_column"):
         if not isinstance(getattr(model, name), str | None):
             raise InputError(
-                f"{path}: its {name} is {value_text(getattr(model, name))}; expected a word."
+                f"{path}: its {name} is {show(getattr(model, name))}; expected a word."
             )
     for name, value, shape in _expected_arrays(model):
         if value is None:
@@ -71,12 +70,12 @@ def check_loaded(model: Any, path: Path) -> None:
     for entry in getattr(model.form.features, "entries", model.form.features):
         if not isinstance(entry.text, str):
             raise InputError(
-                f"{path}: a learner's input is {value_text(entry.text)}; expected an expression."
+                f"{path}: a learner's input is {show(entry.text)}; expected an expression."
             )
     for lag in getattr(model.form, "layout", ()):
         if type(lag.lag) is not int or not 0 <= lag.lag <= _LONGEST_LAG:
             raise InputError(
-                f"{path}: its layout has a lag of {value_text(lag.lag)}; expected 0 to "
+                f"{path}: its layout has a lag of {show(lag.lag)}; expected 0 to "
                 f"{_LONGEST_LAG} rows."
             )
     if model.form.differentiable:

@@ -123,7 +123,7 @@ class PairedChunks:
 
 
 def split_chunks(chunks: Any) -> list[Any]:
-    """Return the rows of each: the inverse of `together`."""
+    """Return the rows of each: the inverse of `join_chunks`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 

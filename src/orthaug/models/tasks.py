@@ -59,7 +59,7 @@ class Tasks(InMemory):
 
         The function, its arguments and results are pickled, `given` once while it is the same.
         """
-        shared = self._shared(given)
+        shared = self._share(given)
         with _heard_on(self.client) as (topic, said):
 
             def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Any:
@@ -86,7 +86,7 @@ class Tasks(InMemory):
         """Return the memory of the smallest worker, which makes whole runs."""
         return smallest_worker(self.client, _MATRICES)
 
-    def _shared(self, given: Any) -> Any:
+    def _share(self, given: Any) -> Any:
         """Return the reference by which workers know `given`."""
         from dask import config
 

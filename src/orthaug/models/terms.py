@@ -11,7 +11,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.data.regressors import Lags
@@ -68,8 +68,7 @@ class Terms:
                 or any(not isinstance(t, str) for t in given)
             ):
                 raise InputError(
-                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got "
-                    f"{value_text(given)}."
+                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got {show(given)}."
                 )
             object.__setattr__(self, name, tuple(given))
         check_fields(self)

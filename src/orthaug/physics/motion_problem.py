@@ -69,7 +69,7 @@ class MotionProblem:
         return replace(self, record=record)
 
     @cached_property
-    def looked_at(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
+    def guessed_points(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
         """Guessed states and inputs at some rows of the record."""
         states, inputs = [], []
         share = max(1, _LOOKED_AT // len(self.record.experiments))
@@ -90,7 +90,7 @@ class MotionProblem:
         Raises:
             InputError: functions that return another shape.
         """
-        motion, (x, u) = self.motion, self.looked_at
+        motion, (x, u) = self.motion, self.guessed_points
         with np.errstate(all="ignore"):
             rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
             outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
@@ -122,7 +122,7 @@ class MotionProblem:
     @cached_property
     def modes(self) -> Complex[np.ndarray, "m nx"]:
         """Eigenvalues of ∂f/∂x [1/s] at the initial parameters and the finite guessed states."""
-        x, u = self.looked_at
+        x, u = self.guessed_points
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
         with np.errstate(all="ignore"):

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, value_text
+from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
@@ -294,9 +294,7 @@ def check_parameters(
             )
     for name, value in constants.items():
         if not is_number(value):
-            raise InputError(
-                f"the constant '{name}' must be a finite number; got {value_text(value)}."
-            )
+            raise InputError(f"the constant '{name}' must be a finite number; got {show(value)}.")
     for p in parameters:
         check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
@@ -305,7 +303,7 @@ def check_parameters(
             )
         if not is_number(p.initial):
             raise InputError(
-                f"the initial value of '{p.name}' must be a finite number; got {value_text(p.initial)}."
+                f"the initial value of '{p.name}' must be a finite number; got {show(p.initial)}."
             )
         check_label(p.unit, f"the unit of '{p.name}'")
         check_bounds(p.name, p.min, p.max)

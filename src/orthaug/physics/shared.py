@@ -74,7 +74,7 @@ class Shared:
         """Return these directions and those that the rows do not separate from the features."""
         if rest is None:
             return self
-        more = rest.imitated(self.basis)
+        more = rest.imitated_directions(self.basis)
         if not more.shape[1]:
             return replace(self, rest=rest)
         moved = [
@@ -113,7 +113,7 @@ class Shared:
             )
         return tuple(described)
 
-    def leaving(self, held: Iterable[int]) -> Shared:
+    def without_entries(self, held: Iterable[int]) -> Shared:
         """Return the shared directions that leave some entries of θ unchanged.
 
         In reduced form too.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.lines import count_text, plain_number
+from orthaug._base.lines import plain_number, plural
 from orthaug.reports.findings import SuspectResult
 from orthaug.reports.result import ParameterResult
 
@@ -77,8 +77,8 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     )
     shown = [suspects[i].name for i in rows]
     parts = [
-        (len(rows), count_text(len(suspects), "suspect")),
-        (len(columns), count_text(len(names), "parameter")),
+        (len(rows), plural(len(suspects), "suspect")),
+        (len(columns), plural(len(names), "parameter")),
     ]
     fewer = " and ".join(
         f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])

@@ -320,7 +320,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, caption, traces, layout, 280, small=True))
     return plots + [
-        _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
+        _means_plot(test, name, curve, what, units) for name, curve in test.strongest.items()
     ]
 
 

@@ -27,7 +27,7 @@ _LEVEL = 0.02  # share of the learned part below which an input is said to expla
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     """Return the curves over the inputs, by the share that each explains, and the surface."""
     shares = part.shares()
-    ranked = list(part.ranked())
+    ranked = list(part.rank())
     blocks: list[Text | Grid | Plot] = [Text(_introduction(part, ranked, shares, measure))]
     plots = [
         _curve_plot(part, k, feature, shares[part.features.index(feature), k])
@@ -42,7 +42,7 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
             )
         )
     if len(ranked) > 1:
-        blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
+        blocks += [_surface_plot(part, k, *part.leading_pair()) for k in range(len(part.names))]
     return blocks
 
 
@@ -83,7 +83,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         "yaxis": {"title": {"text": name}},
         "shapes": [],
     }
-    curve = None if part.tied(feature) else part.curve(feature)
+    curve = None if part.is_tied(feature) else part.curve(feature)
     text, one = f"Over {feature}", len(part.features) == 1
     if curve is not None:
         traces += _curve_traces(curve, k)
@@ -197,7 +197,7 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
     }
     how = (
         "all else at its median"
-        if part.alone(across, along)
+        if part.is_separable(across, along)
         else "the mean of the training data in each cell"
     )
     caption = (

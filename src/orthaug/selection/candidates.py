@@ -64,7 +64,7 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
             "looked at on the free run."
         )
         notes.append(Warning("terms_shortlisted", text))
-    return Candidates(library.picked(kept), tuple(notes), int(own.sum()))
+    return Candidates(library.pick(kept), tuple(notes), int(own.sum()))
 
 
 @dataclass(frozen=True, eq=False)

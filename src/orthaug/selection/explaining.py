@@ -49,7 +49,7 @@ class LearnerTarget:
     def of(cls, linearization: LearnedLinearization) -> LearnerTarget:
         """Return the target in the learner's tangent space over the points, where it has one."""
         q = basis_of(linearization.physics_moves.T)
-        raw = linearization.fitted(linearization.learner)
+        raw = linearization.fitted_values(linearization.learner)
         rest, size, tangent = (
             project_out_basis(raw, q),
             float(np.linalg.norm(raw)),
@@ -107,7 +107,7 @@ class LearnerTarget:
         if not np.isfinite(column).all():
             return np.full(len(self.target), np.nan)
         if self.view is None:
-            return project_out_basis(self.linearization.fitted(column), self.q)
+            return project_out_basis(self.linearization.fitted_values(column), self.q)
         return self.view.T @ column
 
 
@@ -267,7 +267,7 @@ class Space:
             0.0,
         )
 
-    def explained(self, chosen: Sequence[Vector]) -> float:
+    def explained_share(self, chosen: Sequence[Vector]) -> float:
         """Return the share of the learner that chosen columns explain together."""
         return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
 
@@ -370,7 +370,7 @@ def select(space: Space, most: int, least: float) -> list[Candidate]:
 
 
 def _share(space: Space, chosen: Sequence[Candidate]) -> float:
-    return space.explained([space.column(one) for one in chosen])
+    return space.explained_share([space.column(one) for one in chosen])
 
 
 def _grow(space: Space, chosen: list[Candidate]) -> list[Candidate]:
@@ -451,7 +451,9 @@ def _refine(space: Space, chosen: list[Candidate], within: float = _FINE) -> lis
         def unexplained_share(
             log: float, candidate: Candidate = candidate, others: list[Vector] = others
         ) -> float:
-            return -space.explained([*others, space.column(candidate.wide(float(np.exp(log))))])
+            return -space.explained_share(
+                [*others, space.column(candidate.wide(float(np.exp(log))))]
+            )
 
         centre = float(np.log(candidate.width))
         around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
@@ -468,9 +470,10 @@ def _prune(space: Space, chosen: list[Candidate], least: float) -> list[Candidat
     """Return the chosen terms less those that the others make superfluous."""
     while len(chosen) > 1:
         columns = [space.column(one) for one in chosen]
-        whole = space.explained(columns)
+        whole = space.explained_share(columns)
         losses = [
-            whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))
+            whole - space.explained_share(columns[:i] + columns[i + 1 :])
+            for i in range(len(columns))
         ]
         weakest = int(np.argmin(losses))
         if losses[weakest] >= least:
@@ -484,7 +487,7 @@ def _order(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     left, order = list(chosen), []
     while left:
         known = [space.column(one) for one in order]
-        shares = [space.explained([*known, space.column(one)]) for one in left]
+        shares = [space.explained_share([*known, space.column(one)]) for one in left]
         order.append(left.pop(int(np.argmax(shares))))
     return order
 
@@ -523,7 +526,7 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
     rest = linearization.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
     return Fit(
-        least_squares(linearization.physics_moves, linearization.fitted(rest)),
+        least_squares(linearization.physics_moves, linearization.fitted_values(rest)),
         coefficients,
         covariance,
     )
@@ -547,8 +550,8 @@ def rivals(
     """Return other terms that could replace one and explain nearly as much."""
     columns = [space.column(one) for one in chosen]
     others = columns[:number] + columns[number + 1 :]
-    gains = space.gains(others) + space.explained(others)
-    near = gains >= space.explained(columns) - 2 * space.tie
+    gains = space.gains(others) + space.explained_share(others)
+    near = gains >= space.explained_share(columns) - 2 * space.tie
     own = chosen[number]
     found = [space.candidates[int(i)] for i in np.argsort(-gains) if near[int(i)]]
     names = dict.fromkeys(one.name for one in found if one.identity != own.identity)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_count, check_type, is_number
-from orthaug._base.errors import InputError, Warning, value_text
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.lines import percent
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
@@ -372,7 +372,7 @@ def explain(
         model = getattr(fit, "model", None)
         if not isinstance(model, Model | MotionModel):
             raise InputError(
-                f"`model` must be a model or what `estimate` returns; got {value_text(fit)}."
+                f"`model` must be a model or what `estimate` returns; got {show(fit)}."
             )
         record = (
             getattr(getattr(fit, "problem", None), "record", None) if record is None else record
@@ -384,10 +384,10 @@ def explain(
         check_count(most, "most", of="terms"),
     )
     if not is_number(least) or not 0 < least < 1:
-        raise InputError(f"`least` must be a share between 0 and 1; got {value_text(least)}.")
+        raise InputError(f"`least` must be a share between 0 and 1; got {show(least)}.")
     if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
         raise InputError(
-            f"`functions` must be a list of names, such as ['abs']; got {value_text(functions)}."
+            f"`functions` must be a list of names, such as ['abs']; got {show(functions)}."
         )
     linearization = linearization_of(model, record)
     space = Space.of(
@@ -441,7 +441,7 @@ def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bo
         SingleTerm(one.name, one.text, linearization.places[one.place][0], share)
         for one, share in single_terms(space, _SHOWN)
     )
-    share = space.explained([space.column(one) for one in chosen])
+    share = space.explained_share([space.column(one) for one in chosen])
     real = p is None or p < _LEVEL
     if space.empty or not real or share < _HALF * (1 - (noise or 0.0)):
         chosen, text = [], _why_nothing(space, real, dropped, share, singles)
@@ -515,7 +515,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
     )
     for i, one in enumerate(chosen):
         place, unit = linearization.places[one.place]
-        whole = space.explained(columns[: i + 1])
+        whole = space.explained_share(columns[: i + 1])
         scale = _scale(one.kind, one.on, one.text)
         found.append(
             ExplainingTerm(
@@ -529,7 +529,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
                 unit=coefficient_unit(unit, linearization.parse(scale), linearization.units),
                 std=None if std is None else float(std[i]),
                 share=whole - before,
-                alone=space.explained([columns[i]]),
+                alone=space.explained_share([columns[i]]),
                 rivals=rivals(space, chosen, i),
             )
         )

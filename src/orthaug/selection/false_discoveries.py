@@ -29,7 +29,7 @@ class Control:
     level: float
     candidates: int
 
-    def allowed(self, size: int) -> float:
+    def largest_p(self, size: int) -> float:
         """Return the largest p-value of a term of a model of so many terms."""
         return self.level * size / (self.candidates + 1 - size * (1 - self.level))
 

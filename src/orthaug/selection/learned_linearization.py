@@ -87,7 +87,7 @@ class LearnedLinearization:
             )
         return (values[:, None] * self.weight[:, place]).ravel()
 
-    def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+    def fitted_values(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
         """Return the effect of columns over the points on the fitted values (R, …)."""
         return columns if self.response is None else self.response.forward(columns)
 
@@ -289,7 +289,7 @@ def _derivatives(
     form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
 ) -> tuple[Any, Any]:
     """Return ∂(next state)/∂x and ∂y/∂x at points."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
     return steps, jax.vmap(lambda x, u: jax.jacfwd(lambda s: form.observed(numbers, s, u))(x))(x, u)
 

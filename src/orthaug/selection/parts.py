@@ -38,7 +38,7 @@ class Intervals:
     text: str
 
     @classmethod
-    def none(cls, why: str) -> Intervals:
+    def empty(cls, why: str) -> Intervals:
         """Return that there are none, and why."""
         return cls(
             NONE,

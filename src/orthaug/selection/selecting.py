@@ -228,7 +228,7 @@ class Selection:
     """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None
     for no such.
     """
-    intervals: Intervals = Intervals.none("all rows chose")
+    intervals: Intervals = Intervals.empty("all rows chose")
     """Where intervals of a fit of the choice come from."""
     level: float = LEVEL
     """The rate of false discoveries that was allowed."""
@@ -354,11 +354,11 @@ class Selection:
         return pd.DataFrame(rows)
 
     def _stages(self) -> list[tuple[str, Sequence[RankedModel]]]:
-        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judged())]
+        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judge())]
         if self.terms is not None:
-            stages.append(("terms", self.terms.judged()))
+            stages.append(("terms", self.terms.judge()))
         if self.learners is not None:
-            stages.append(("learner", self.learners.judged()))
+            stages.append(("learner", self.learners.judge()))
         return stages
 
     def summary(self) -> str:
@@ -581,11 +581,11 @@ def _parts(
     if network:
         return Parts(record, record, CONDITIONAL)
     if halves is not None:
-        return Parts(record, record, Intervals.none("`halves` is false"))
+        return Parts(record, record, Intervals.empty("`halves` is false"))
     try:
         return split_record(record, baseline, lags)
     except InputError as error:
-        return Parts(record, record, Intervals.none(str(error)))
+        return Parts(record, record, Intervals.empty(str(error)))
 
 
 def lagged_rows(problem: Problem, lags: Lags | None) -> int:

@@ -125,14 +125,14 @@ class Search:
 
     rungs: tuple[PathModel, ...]
 
-    def judged(self) -> tuple[RankedModel, ...]:
+    def judge(self) -> tuple[RankedModel, ...]:
         """Return every model beside the best."""
         return judge_all(self.rungs)
 
     @property
     def place(self) -> int:
         """The number of the choice."""
-        return next(i for i, one in enumerate(self.judged()) if one.chosen)
+        return next(i for i, one in enumerate(self.judge()) if one.chosen)
 
 
 class Blocks:
@@ -173,7 +173,7 @@ class Blocks:
             errors, seconds = zip(*islice(found, len(self.folds)), strict=True)
             yield np.array(errors), sum(seconds)
 
-    def fitted(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
+    def fit_each(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
         """Yield each choice fitted to all of the record and judged; and what it took [s]."""
         points = list(self.runner.map(_on_all, self.given, choices))
         judged = self.judge([point for point, _ in points])
@@ -258,7 +258,7 @@ class TermPath(Search):
         chosen = set(self.chosen.point.chosen)
         return next((able for able in self.ways if chosen <= set(able)), None)
 
-    def judged(self) -> tuple[RankedModel, ...]:
+    def judge(self) -> tuple[RankedModel, ...]:
         found = judge_all(self.rungs, self.confirmed)
         if self.kept is None:
             return found
@@ -514,7 +514,7 @@ def _apply_control(path: TermPath, judged: Any) -> int | None:
     while control is not None and rung.size:
         began, point = time.monotonic(), rung.point
         p = p_values(runs, point)
-        if p.max() <= control.allowed(rung.size):
+        if p.max() <= control.largest_p(rung.size):
             break
         gone = point.chosen[int(np.argmax(p))]
         left = tuple(i for i in point.chosen if i != gone)

@@ -128,7 +128,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         where, scripts = f"set 1, 30 dB, {structure}", _scripts(structure)
         squares, printed = TEST_SAMPLES * rows.test_rmse**2, SQUARES[structure]
         met, why = _beside_printed(squares, printed)
-        why += f"; run again, the scripts print {scripts['test_sse']}{_stopping_sentence(table, structure)}"
+        why += f"; run again, the scripts print {scripts['test_sse']}"
+        why += _stopping_sentence(table, structure)
         compared.append(
             Finding(
                 f"{where}: sum of squared test errors",

@@ -77,7 +77,7 @@ class Gate:
         comes = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
         allowed = self._from_here(headers) and (
             _equal_secrets(given, self.token)
-            or _equal_secrets(self._kept(headers), self._secret)
+            or _equal_secrets(self._cookie_of(headers), self._secret)
             or (comes and self._spend(given))
         )
         if not allowed:
@@ -96,7 +96,7 @@ class Gate:
             origin is None or origin in {f"http://{host}" for host in hosts}
         )
 
-    def _kept(self, headers: Mapping[str, str]) -> str | None:
+    def _cookie_of(self, headers: Mapping[str, str]) -> str | None:
         try:
             morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:

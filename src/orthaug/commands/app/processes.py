@@ -79,13 +79,13 @@ class Command:
         """Start the command and follow it to its end; one that cannot start counts as failed."""
         self.began = time.monotonic()
         try:
-            self.code = await self._followed()
+            self.code = await self._follow()
         except OSError as error:
             self.lines, self.code = [f"error: the command cannot start ({error.strerror})."], 2
         self.ended = time.monotonic()
         self.changed()
 
-    async def _followed(self) -> int:
+    async def _follow(self) -> int:
         """Return the exit code of the command."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
@@ -166,7 +166,7 @@ class WorkerPool:
             InputError: the question was refused.
         """
         async with self._room:
-            process = await self._taken()
+            process = await self._take()
             self._busy.add(process)
             answer: dict[str, Any] = {"last": True}
             try:
@@ -187,7 +187,7 @@ class WorkerPool:
         if self._coming is None and not self._idle:
             self._coming = asyncio.ensure_future(_start_worker())
 
-    async def _taken(self) -> asyncio.subprocess.Process:
+    async def _take(self) -> asyncio.subprocess.Process:
         while self._idle:
             process = self._idle.pop()
             if process.returncode is None:

@@ -124,7 +124,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
             lines.append(
-                f"<td class='{kind}' data-label='{escape(name, True)}'>{_unbreakable_lags(value)}</td>"
+                f"<td class='{kind}' data-label='{escape(name, True)}'>"
+                f"{_unbreakable_lags(value)}</td>"
             )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")

@@ -179,8 +179,8 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             from orthaug._base.jax import use_compilation_cache
 
             use_compilation_cache()
-        result = kind_of(job).checked(job)
-        refused = kind_of(job).refused(job, result)
+        result = kind_of(job).check(job)
+        refused = kind_of(job).refusal(job, result)
         bias = [
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()

@@ -223,7 +223,7 @@ def descend(
             point.loss,
         )
         ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
-    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.point.loss):
+    while ending is Ending.RUNNING and not limit.is_past(done, mark, iterate.point.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
             lower = iterate.point.loss < LEARNED * first_loss or iterate.small > 0
@@ -269,12 +269,12 @@ def descend(
 
 def _pause(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
-    held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
+    held = (objective.values_of(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
 def _resume(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
-    point = objective.again(paused.point)
+    point = objective.trial_of(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
     iterate = _Iterate(

@@ -91,7 +91,7 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """Minimise the same pass by pass, for rows elsewhere; see `compiled.driven`."""
+        """Minimise the same pass by pass, for rows elsewhere; see `compiled.minimise_by_engine`."""
         return compiled.minimise_by_engine(normal_at, w, overlap, self._settings(**options))
 
     def descend(
