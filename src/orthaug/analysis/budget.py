@@ -250,7 +250,8 @@ def budget_on(
     rest = np.array([*rest, *map(_theta_shift, nameless)])
     candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    other = _norm([_theta_shift(cause) for cause in nameless])
+    shifts = [_theta_shift(cause) for cause in nameless]
+    other = np.linalg.norm(np.array(shifts), axis=0) if shifts else 0.0
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
     names = linearization.problem.baseline.names
     parameters = parameter_biases(
@@ -269,10 +270,6 @@ def budget_on(
         own, cause = found[0]
         raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
     return Budget(causes, parameters, rows, (*raised, *warnings))
-
-
-def _norm(rows: Sequence[Vector]) -> Vector | float:
-    return np.linalg.norm(np.array(rows), axis=0) if len(rows) else 0.0
 
 
 def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:

@@ -14,10 +14,8 @@ from orthaug.physics.baseline import Baseline
 from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, split_record
 
 if TYPE_CHECKING:
-    from orthaug.commands.data_sections import PartSection
     from orthaug.commands.lagged_job import LaggedJob
     from orthaug.commands.spec import Spec
-    from orthaug.data.record import Record
 
 _CONDITIONAL = (
     "no standard errors and no intervals: [selection.chosen_on] says that the terms were "
@@ -112,16 +110,12 @@ def split_rows(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
         if len(files) > 1:
             return Rows(whole.files[:count], whole.ranges), Rows(whole.files[count:], whole.ranges)
         return Rows(whole.files, whole.ranges[:count]), Rows(whole.files, whole.ranges[count:])
-    ranges = whole.ranges or ((0, _rows_of(section, record)),)
+    ranges = whole.ranges or ((0, section.every * len(record)),)
     lengths = [len(one) for one in parts.chooses.experiments]
     places = [first + section.every * lengths[i] for i, (first, _) in enumerate(ranges)]
     first = tuple((a, place) for (a, _), place in zip(ranges, places, strict=True))
     second = tuple((place, b) for (_, b), place in zip(ranges, places, strict=True))
     return Rows(whole.files, first), Rows(whole.files, second)
-
-
-def _rows_of(section: PartSection, record: Record) -> int:
-    return section.every * len(record)
 
 
 def intervals_of(job: Any, fit: Any) -> Intervals | None:

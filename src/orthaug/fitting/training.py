@@ -156,7 +156,8 @@ def train(
                 "physics alone"
             )
     LOG.info("run %d of %d is chosen; 0 is physics alone", best + 1, len(runs))
-    alike = _members(starts, ranking, best) if choice.scored else _same_regularization(starts, best)
+    same = [i for i, one in enumerate(starts) if one.regularization == starts[best].regularization]
+    alike = _members(starts, ranking, best) if choice.scored else same
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
@@ -221,13 +222,6 @@ def _cross_validation(task: Task, run: Any) -> float:
     samples = task.problem.samples
     left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
-
-
-def _same_regularization(starts: Sequence[PlannedRun], best: int) -> list[int]:
-    """Return the runs with the regularization of the best one."""
-    return [
-        i for i, start in enumerate(starts) if start.regularization == starts[best].regularization
-    ]
 
 
 def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:

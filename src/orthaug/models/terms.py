@@ -102,7 +102,10 @@ class Terms:
         Raises:
             InputError: too many terms, or an excluded one that is none.
         """
-        return self if not self.degree else replace(self, **_library_entries(self.library(signals)))
+        if not self.degree:
+            return self
+        texts = self.library(signals).texts
+        return replace(self, terms=texts, degree=0, functions=(), exclude=(), inputs=texts)
 
     def library(self, signals: Sequence[str]) -> TermLibrary:
         """Return the terms as products of few factors."""
@@ -142,16 +145,6 @@ class Terms:
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         return jnp.asarray(tree) @ z
-
-
-def _library_entries(library: TermLibrary) -> dict[str, Any]:
-    return {
-        "terms": library.texts,
-        "degree": 0,
-        "functions": (),
-        "exclude": (),
-        "inputs": library.texts,
-    }
 
 
 def over_lags(

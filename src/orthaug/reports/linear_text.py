@@ -61,7 +61,7 @@ def _stability(view: LinearView) -> str:
 def _point_text(view: LinearView) -> str:
     named = view.point.outputs | view.point.values
     order = [*view.inputs, *(name for name in named if name not in view.inputs)]
-    return ", ".join(f"{name} = {_number_text(named[name])}{_unit(view, name)}" for name in order)
+    return ", ".join(f"{name} = {named[name] + 0.0:.6g}{_unit(view, name)}" for name in order)
 
 
 def _unit(view: LinearView, name: str) -> str:
@@ -185,7 +185,3 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
 
 def _interval(ends: Any) -> str:
     return "" if ends is None else f"[{ends[0]:.5g}, {ends[1]:.5g}]"
-
-
-def _number_text(value: float) -> str:
-    return f"{value + 0.0:.6g}"
