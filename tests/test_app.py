@@ -413,7 +413,7 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
 
     monkeypatch.setattr("orthaug.commands.app.processes._start_worker", refused)
     assert asyncio.run(looked()) == "no process can be started (Resource temporarily unavailable)."
-    monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
+    monkeypatch.setattr("orthaug.commands.app.session.Session.reword", lambda *_: 1 / 0)
     assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
 
 
@@ -1145,7 +1145,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
     gone = tab.context.request.get(f"{server.base}session/absent")
-    assert gone.status == 404 and "this session has ended" in gone.text()
+    assert gone.status == 404 and "This session has ended" in gone.text()
     tab.close()
 
 
