@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from orthaug._base.checks import check_choice, check_count, check_label, check_number, check_type
-from orthaug._base.errors import LONGEST, InputError, KeyedError, TrainingError, shown
+from orthaug._base.errors import LONGEST, InputError, KeyedError, TrainingError, show
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel
 
@@ -78,7 +78,7 @@ VALUES = {
 
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())
 def test_values_are_shown_on_one_line(value):
-    assert len(shown(value)) <= LONGEST and shown(value).isprintable()
+    assert len(show(value)) <= LONGEST and show(value).isprintable()
     for check in (
         lambda: check_number(value, "x"),
         lambda: check_count(value if not isinstance(value, int) else -value, "x"),

@@ -11,7 +11,7 @@ from test_cli import finite_json, run
 from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate, reweighted
+from orthaug.fitting.estimation import estimate, reweight
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import joint_covariance
@@ -238,7 +238,7 @@ def test_the_free_run_takes_them_too():
 
 def test_turns_that_do_not_settle_are_told():
     first, second = (estimate(two_outputs(unit), BASELINE, learner=None) for unit in (20.0, 30.0))
-    last = reweighted(first, lambda problem, before: second if before is first else first)
+    last = reweight(first, lambda problem, before: second if before is first else first)
     assert [w.code for w in last.warnings] == ["output_weights_unsettled"]
 
 

@@ -13,7 +13,7 @@ from test_parallel import PHYSICS, record_of
 from orthaug._base.errors import InputError
 from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.rules import tried
+from orthaug.fitting.rules import choose_regularizations
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal
@@ -152,7 +152,10 @@ def test_what_auto_stands_for(change, expected):
         "criterion": Prediction(),
         "structure": Orthogonal(),
     }
-    assert tried(**(usual | {"linear": True, "validated": False} | change)) == expected
+    assert (
+        choose_regularizations(**(usual | {"linear": True, "validated": False} | change))
+        == expected
+    )
 
 
 @pytest.mark.parametrize(
