@@ -108,7 +108,8 @@ def of_examples() -> dict[str, pd.DataFrame]:
         for part, rows, seed in (("train", 250, 1), ("test", 120, 2))
     }
     measured = {"silverbox": oscillator, "cascaded_tanks": cascaded_tanks, "mr_damper": damper}
-    return drawn | {name: system(400, 20) for name, system in measured.items()}
+    long = {"silverbox_long": oscillator(1000, 21)}  # for a learner of hundreds of terms
+    return drawn | long | {name: system(400, 20) for name, system in measured.items()}
 
 
 def flawed(table: pd.DataFrame, seed: int) -> pd.DataFrame:

@@ -28,7 +28,7 @@ from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
-from orthaug.commands.app.worker import thinned
+from orthaug.commands.app.worker import thin_curve
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
 
@@ -212,10 +212,10 @@ def test_a_curve_is_thinned_to_what_is_seen():
     x = np.arange(100_000.0)
     y = np.sin(x / 1e4)
     y[31_234], y[77:90] = 5.0, np.nan
-    drawn = thinned(x, y)
+    drawn = thin_curve(x, y)
     assert len(drawn["x"]) <= 3000 and max(v for v in drawn["y"] if v is not None) == 5.0
     assert drawn["x"] == sorted(drawn["x"])  # type: ignore[type-var]
-    assert thinned(x[77:200], y[77:200])["y"][:13] == [None] * 13
+    assert thin_curve(x[77:200], y[77:200])["y"][:13] == [None] * 13
 
 
 def test_the_address_in_the_browsers_arguments_opens_the_page_once():
@@ -272,7 +272,9 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
             "path": "/",
             "query_string": b"",
         }
-        reply = asyncio.run(routes._kept(sessions, session.key, "run.csv", Request(scope, receive)))  # type: ignore
+        reply = asyncio.run(
+            routes._keep_upload(sessions, session.key, "run.csv", Request(scope, receive))
+        )  # type: ignore
         return reply.status_code, bytes(reply.body).decode()
 
     for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
@@ -309,7 +311,7 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
         "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
     )
     job = load_spec(tmp_path / "spec.toml")
-    runs = job.planned(AS_DECLARED)
+    runs = job.plan_of(AS_DECLARED)
     assert [tuple(run.values()) for run in runs] == [
         *(
             ("orthogonal", 1, "none"),
@@ -318,10 +320,10 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             ("orthogonal", 2, "ard"),
         )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+    assert len(runs) == job.run_count and job.plan_of(Variant(PHYSICS_ONLY)) == (
         {"structure": PHYSICS_ONLY},
     )
-    penalised = job.planned(Variant("baseline-penalty"))
+    penalised = job.plan_of(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
     monkeypatch.setattr("orthaug.commands.bars._OFTEN", 0.0)
@@ -391,7 +393,7 @@ def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path,
     monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)
     monkeypatch.setattr(page.model, "follow_data", lambda: seen.append("model"))
     monkeypatch.setattr(page.training, "follow_work", lambda: seen.append("training"))
-    session.changed("data")
+    session.mark_changed("data")
     page.follow()
     assert [type(error) for error in told] == [ZeroDivisionError] and seen == ["model", "training"]
     page.follow()
@@ -410,9 +412,9 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         await session.desk.close()
         return session.trouble
 
-    monkeypatch.setattr("orthaug.commands.app.processes._started", refused)
+    monkeypatch.setattr("orthaug.commands.app.processes._start_worker", refused)
     assert asyncio.run(looked()) == "no process can be started (Resource temporarily unavailable)."
-    monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
+    monkeypatch.setattr("orthaug.commands.app.session.Session.reword", lambda *_: 1 / 0)
     assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
 
 
@@ -447,7 +449,7 @@ def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, 
                 await desk.ask("look")
             assert started == starts
 
-    monkeypatch.setattr("orthaug.commands.app.processes._started", counted)
+    monkeypatch.setattr("orthaug.commands.app.processes._start_worker", counted)
     asyncio.run(twice())
 
 
@@ -607,7 +609,10 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     assert session.found is not None and session.data is not None
     assert view._whole_file()[0] == "motor_test.csv"  # nothing was checked yet
     view._take_uses(session.found)
-    assert view.uses == {"left": "input", "right": "output"} and view._lacking(session.found) == []
+    assert (
+        view.uses == {"left": "input", "right": "output"}
+        and view._missing_columns(session.found) == []
+    )
     session.checked = {"files": [str(session.folder / "motor_train.csv")]}
     assert view._whole_file() == (
         "motor_train.csv",
@@ -615,13 +620,13 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     )
     session.raw.clear()
     assert view._whole_file() == ("", {})
-    assert export._beside() == ["motor_train.csv"]
+    assert export._uploaded_files() == ["motor_train.csv"]
     session.spec = spec_text.with_value(
         session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]}
     )
-    assert export._beside() == ["motor_train.csv", "motor_test.csv"]
+    assert export._uploaded_files() == ["motor_train.csv", "motor_test.csv"]
     session.spec = session.spec.replace('"left"', '"up"')
-    assert view._lacking(session.found) == ["up"]
+    assert view._missing_columns(session.found) == ["up"]
     view._drawn = (None, None, False)
     view._take_uses(session.found)
     assert view.uses == {"left": "", "right": ""}
@@ -1141,7 +1146,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
     assert tab.get("spec.toml?show=true").headers["content-disposition"][:10] == "attachment"
     assert tab.fetch("../x") and tab.get("result.zip").status == 404
     gone = tab.context.request.get(f"{server.base}session/absent")
-    assert gone.status == 404 and "this session has ended" in gone.text()
+    assert gone.status == 404 and "This session has ended" in gone.text()
     tab.close()
 
 

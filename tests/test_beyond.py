@@ -200,7 +200,7 @@ def test_a_motion_fades():
     slow, fast = (
         np.asarray(model.step(np.array([0.0, speed]), np.zeros(1))[0]) for speed in (0.0, 1e3)
     )
-    physics = np.asarray(model.alone.step(np.array([0.0, 1e3]), np.zeros(1))[0])
+    physics = np.asarray(model.physics_only.step(np.array([0.0, 1e3]), np.zeros(1))[0])
     np.testing.assert_allclose(fast, physics, rtol=1e-9)
     assert p["k"] > 0 and np.isfinite(slow).all()
 

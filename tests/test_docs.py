@@ -210,7 +210,7 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
     spec.write_text(
         re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE)
     )
-    with LEARNERS.added("polynomial", polynomial):
+    with LEARNERS.with_kind("polynomial", polynomial):
         assert orthaug.load_spec(spec).spec.declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
     with pytest.raises(
@@ -268,3 +268,19 @@ def test_the_most_used_names_have_examples():
         for name in wanted.split()
         if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")
     } == set()
+
+
+def test_the_glossary_is_short_sorted_and_plain() -> None:
+    """At most 25 words of our own, in order, each explained in at most two sentences and in use elsewhere."""
+    page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", page, re.M)[1:]
+    terms = [term for term, _ in rows]
+    others = " ".join(
+        file.read_text(encoding="utf-8")
+        for file in (ROOT / "docs").rglob("*.md")
+        if file.name != "glossary.md"
+    )
+    assert 15 <= len(terms) <= 25 and terms == sorted(set(terms))
+    used = others.replace("_", " ")
+    assert [one for one in terms if not re.search(one.split(", ")[0], used, re.I)] == []
+    assert [term for term, text in rows if not text.endswith(".") or text.count(". ") > 1] == []

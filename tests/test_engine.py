@@ -35,7 +35,7 @@ from orthaug.models.learners import Bound
 from orthaug.models.rows import Engine, InMemory, MixedGram, Overlaps
 from orthaug.models.streaming import read_ahead
 from orthaug.physics.problem import pose
-from orthaug.physics.streamed import streamed
+from orthaug.physics.streamed import stream_problem
 
 SIZE, ROWS = (
     53,
@@ -366,7 +366,7 @@ def source(problem, size):
 def test_a_problem_of_a_source_is_that_of_its_record(structure, regularization, ny):
     """Posed by passes over partitions, and trained on what they give."""
     problem, engine = posed(ny), Streaming()
-    there = streamed(problem, source(problem, 47), engine.passes)
+    there = stream_problem(problem, source(problem, 47), engine.passes)
     assert there.count == problem.count
     np.testing.assert_allclose(there.least_squares, problem.least_squares, rtol=1e-13)
     np.testing.assert_allclose(there.freedom_used, problem.freedom_used, rtol=1e-13)
@@ -396,7 +396,7 @@ def test_ill_conditioned_physics_keeps_its_digits():
     u = rng.normal(size=(400, 2)) @ [[1.0, 1.0], [0.0, 1e-7]]
     record = Record.from_arrays(u, u @ [1.0, 2.0] + 1e-3 * rng.normal(size=400))
     problem = pose(record, Baseline.from_terms([Term("a", "u1[k]"), Term("b", "u2[k]")]))
-    there = streamed(problem, source(problem, 90), Stream().passes)
+    there = stream_problem(problem, source(problem, 90), Stream().passes)
     assert there.excitation.condition == pytest.approx(problem.excitation.condition, rel=1e-6)
     assert problem.excitation.condition > 1e6
     gram = np.einsum("koi,koj->ij", there.projection.q, there.projection.q)
@@ -415,7 +415,7 @@ def test_what_is_wrong_with_a_row_is_found_where_it_is():
         InputError,
         match=r"run.csv: row 137: the regressor of b \(log\(u\[k\]\)\) is not finite there",
     ):
-        streamed(problem, source(problem, 50), Stream().passes)
+        stream_problem(problem, source(problem, 50), Stream().passes)
 
 
 def test_a_reader_s_error_reaches_the_caller():

@@ -163,9 +163,9 @@ def test_the_residual_of_all_rows_is_tested_where_a_witness_stands_for_them(fold
 @pytest.fixture(scope="module")
 def cluster():
     pytest.importorskip("distributed")
-    from orthaug.models.cluster import connected
+    from orthaug.models.cluster import connect
 
-    client = connected(None, 2)
+    client = connect(None, 2)
     yield client
     client.close()
     client.cluster.close()

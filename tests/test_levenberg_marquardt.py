@@ -278,7 +278,7 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     options = compiled.Options(
         jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES))
     )
-    start = compiled._begun(
+    start = compiled._first_state(
         w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1)
     )
     whole = compiled._advance(

@@ -16,7 +16,7 @@ from test_surface import WRONG, tried
 
 import orthaug as oa
 from orthaug import InputError
-from orthaug.analysis.linear_system import System, converted, modes_of, observer_form
+from orthaug.analysis.linear_system import System, convert_to_continuous, modes_of, observer_form
 from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag
 from orthaug.models.stepping import Memory
@@ -298,12 +298,12 @@ def test_a_hold_is_undone_with_its_dead_time():
             matrix[i, n] = 1.0
     matrix[n, :n] = [row.get(name, 0.0) for name in memory.names]
     matrix[0] = matrix[n]
-    found = converted(System(matrix, n, STEP), "zoh", memory, memory.names)
+    found = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
     assert not isinstance(found, str) and list(found.dead_time) == pytest.approx([3 * STEP])
     s = 2j * np.pi * np.array([0.1, 1.0, 5.0])
     np.testing.assert_allclose(found.system.response(s).value[:, 0, 0], plant(s), rtol=1e-8)
     matrix[0, :2] = matrix[n, :2] = -0.3, 0.1
-    told = converted(System(matrix, n, STEP), "zoh", memory, memory.names)
+    told = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
     assert isinstance(told, str) and "a real pole below 0 (-0.5)" in told
 
 

@@ -476,7 +476,9 @@ def test_a_short_recording_has_a_prediction(folder, model):
 
 def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     m, c, k = model.parameters.values()
-    stability = motion_stability(model.alone, np.array([[0.1, 0.0], [0.0, 1.0]]), np.zeros((2, 1)))
+    stability = motion_stability(
+        model.physics_only, np.array([[0.1, 0.0], [0.0, 1.0]]), np.zeros((2, 1))
+    )
     found = stability.modes
     assert (found.rightmost, found.fastest) == pytest.approx((-c / (2 * m), np.sqrt(k / m)))
     assert found.growing == 0 and not stability.warnings

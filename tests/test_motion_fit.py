@@ -9,7 +9,7 @@ import pytest
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.missing_terms import doubted, sensitivities
+from orthaug.analysis.missing_terms import doubted_equations, sensitivities
 from orthaug.analysis.motion_diagnosis import _colour, _traces
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
@@ -370,7 +370,9 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     assert model.predict(record).scores().rmse[0] < 1.5 * 0.002 + 0.002
     (trajectory,) = free.trajectories
     np.testing.assert_allclose(trajectory.baseline + trajectory.learner, trajectory.model)
-    alone = model.alone.simulate(record, initial=record.experiments[0].outputs).trajectories[0]
+    alone = model.physics_only.simulate(record, initial=record.experiments[0].outputs).trajectories[
+        0
+    ]
     assert np.abs(trajectory.learner).max() > 0.01 and alone.learner.any() == False  # noqa: E712  (an array)
     zero = model.simulate(
         oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero"
@@ -481,7 +483,7 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
     fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
-    assert doubted(fit) == (1,)  # ẋ = v only says what v is
+    assert doubted_equations(fit) == (1,)  # ẋ = v only says what v is
     found = sensitivities(fit, (1,), lambda points: lambda rows: rows[:1], 1)
     assert found is not None and (found.starts, found.nuisance) == (2, 5)
     own, added = found.columns[..., 4], found.columns[..., 5]

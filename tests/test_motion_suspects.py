@@ -62,7 +62,7 @@ def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_siz
 
 def usual_of(fit: oa.MotionEstimate) -> list[str]:
     """Names of the usual terms over the guessed states."""
-    x, u = fit.problem.looked_at
+    x, u = fit.problem.guessed_points
     return [suspect.name for suspect in usual_motion_suspects(fit.problem.motion, x.T, u.T)]
 
 

@@ -23,7 +23,7 @@ from orthaug import (
     load,
     save,
 )
-from orthaug.fitting.estimation import reweighted
+from orthaug.fitting.estimation import reweight
 from orthaug.inference.covariance import joint_covariance
 
 ROWS = 300
@@ -248,7 +248,7 @@ def test_the_free_run_takes_them_too():
 
 def test_turns_that_do_not_settle_are_told():
     first, second = (estimate(two_outputs(unit), BASELINE, learner=None) for unit in (20.0, 30.0))
-    last = reweighted(first, lambda problem, before: second if before is first else first)
+    last = reweight(first, lambda problem, before: second if before is first else first)
     assert [w.code for w in last.warnings] == ["output_weights_unsettled"]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.fitting.recursion import started
+from orthaug.fitting.recursion import start_recursion
 
 
 def rows(seed: int, count: int, ny: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +27,7 @@ def least_squares(phi: np.ndarray, y: np.ndarray) -> np.ndarray:
 def test_it_is_least_squares_on_all_rows(ny):
     old, new = rows(0, 50, ny), rows(1, 3000, ny)
     theta = least_squares(old[0], old[1])
-    recursion = started(*old, theta, np.eye(ny), 1.0, 50 * ny - 3.0, 1.0, empty=False)
+    recursion = start_recursion(*old, theta, np.eye(ny), 1.0, 50 * ny - 3.0, 1.0, empty=False)
     for row, y in zip(*new, strict=True):
         recursion.update(row, y)
     whole = [np.concatenate(pair) for pair in zip(old, new, strict=True)]
@@ -39,7 +39,7 @@ def test_the_noise_level_is_the_residual_sum_of_squares():
     old, new = rows(0, 50), rows(1, 100)
     theta = least_squares(old[0], old[1])
     squares = float(np.sum((old[1] - old[0] @ theta) ** 2))
-    recursion = started(*old, theta, np.eye(1), squares / 47, 47.0, 1.0, empty=False)
+    recursion = start_recursion(*old, theta, np.eye(1), squares / 47, 47.0, 1.0, empty=False)
     for row, y in zip(*new, strict=True):
         recursion.update(row, y)
     phi, y = (np.concatenate(pair) for pair in zip(old, new, strict=True))
@@ -51,7 +51,7 @@ def test_the_noise_level_is_the_residual_sum_of_squares():
 def test_an_empty_start_moves_no_further_than_the_rows_ask():
     old, new = rows(0, 50), rows(1, 5)
     theta = least_squares(old[0], old[1])
-    recursion = started(*old, theta, np.eye(1), 1.0, 47.0, 1.0, empty=True)
+    recursion = start_recursion(*old, theta, np.eye(1), 1.0, 47.0, 1.0, empty=True)
     np.testing.assert_array_equal(recursion.theta, theta)
     recursion.update(new[0][0], new[1][0])
     assert not recursion.determined

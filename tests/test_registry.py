@@ -103,7 +103,7 @@ def test_a_learner_from_outside(project, tmp_path):
         '[learner]\nkind = "powers"\nhighest = 2\ncentre = [1, 2.5]\nhidden = [9]\ninputs = ["u[k-1]", "y[k-1]"]\n',
     )
     assert run("fit", spec).code == 2
-    with LEARNERS.added("powers", Powers):
+    with LEARNERS.with_kind("powers", Powers):
         assert load_spec(spec).spec.declared_learner() == Powers(
             2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
         )
@@ -129,7 +129,7 @@ def test_a_learner_from_outside(project, tmp_path):
 
 
 def test_the_keys_of_a_learner_from_outside_are_checked(project):
-    with LEARNERS.added("powers", Powers):
+    with LEARNERS.with_kind("powers", Powers):
         for key, words in (
             ("highest = 1", "'learner.highest': found 1; expected greater than or equal to 2"),
             ("highest = 2.5", "'learner.highest': found 2.5; expected an integer"),
@@ -151,7 +151,7 @@ def test_a_structure_from_outside(project, tmp_path):
     spec = with_sections(
         project, "nearness", '[structure]\nkind = "nearness"\nstiffness = 1e9\n' + TRAINED
     )
-    with STRUCTURES.added("nearness", Nearness):
+    with STRUCTURES.with_kind("nearness", Nearness):
         assert load_spec(spec).spec.declared_structure() == Nearness(1e9)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
@@ -178,7 +178,7 @@ def test_a_structure_from_outside(project, tmp_path):
 def test_a_measure_from_outside(project, tmp_path):
     sections = '[structure.measure]\nkind = "enlarged"\nfactor = 3\n' + TRAINED
     spec = with_sections(project, "enlarged", sections)
-    with MEASURES.added("enlarged", Enlarged):
+    with MEASURES.with_kind("enlarged", Enlarged):
         assert isinstance(Enlarged(), Measure)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
@@ -280,7 +280,7 @@ REFUSED = [
 )
 def test_entries_that_are_refused(registry, kind, declaration, message):
     before = dict(registry)
-    with pytest.raises(InputError, match=message), registry.added(kind, declaration):
+    with pytest.raises(InputError, match=message), registry.with_kind(kind, declaration):
         pass
     assert dict(registry) == before
 

@@ -28,7 +28,7 @@ from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, fit_sections
-from orthaug.reports.page_runs import Run, compared_plots, error_band, packed, run_plots
+from orthaug.reports.page_runs import Run, compared_plots, error_band, pack_curve, run_plots
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
@@ -177,7 +177,7 @@ def test_curves_hold_the_whole_record_in_finite_numbers(pages, lagged, motion, c
 def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
     part = lagged.job.parts[-1].record
     own = (
-        lagged.fit.model.alone.simulate(part).trajectories[0].model
+        lagged.fit.model.physics_only.simulate(part).trajectories[0].model
     )  # of a motion from the same start
     for kind, fitted, alone in (("lagged", lagged, own), ("motion", motion, None)):
         (run,) = fitted.responses[fitted.job.parts[-1].name][1].trajectories
@@ -401,7 +401,7 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
 
 def test_packed_curves_keep_their_digits_beside_an_offset():
     given = 1e6 + np.sin(np.arange(100.0))
-    assert values(packed(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
+    assert values(pack_curve(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
 
 
 def test_the_band_holds_most_errors_of_training():

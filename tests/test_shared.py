@@ -101,7 +101,7 @@ def test_directions_that_leave_some_entries_where_they_are(seed):
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-6, 6, 6)
     drawn = size[:, None] * rng.normal(size=(6, 4))
-    found = Shared(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).leaving([1, 5])
+    found = Shared(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).without_entries([1, 5])
     expected = drawn @ scipy.linalg.null_space((drawn / size[:, None])[[1, 5]])
     both = np.column_stack([found.basis, expected]) / size[:, None]
     assert found.basis.shape == (6, 2) and not found.basis[[1, 5]].any()
@@ -493,7 +493,7 @@ def test_independent_columns_are_hardly_ever_called_shared():
         )
         rest = left_over(noise[:, None, :], z)
         assert rest is not None
-        called += rest.imitated(np.zeros((3, 0))).shape[1] > 0
+        called += rest.imitated_directions(np.zeros((3, 0))).shape[1] > 0
     assert called == 0
 
 

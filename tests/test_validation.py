@@ -22,7 +22,7 @@ from orthaug import (
     estimate,
     load,
 )
-from orthaug.fitting.rules import tried
+from orthaug.fitting.rules import choose_regularizations
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -156,7 +156,10 @@ def test_what_auto_stands_for(change, expected):
         "criterion": Prediction(),
         "structure": Orthogonal(),
     }
-    assert tried(**(usual | {"linear": True, "validated": False} | change)) == expected
+    assert (
+        choose_regularizations(**(usual | {"linear": True, "validated": False} | change))
+        == expected
+    )
 
 
 @pytest.mark.parametrize(
