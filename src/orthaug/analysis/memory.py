@@ -51,7 +51,7 @@ def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTe
     return terms + [MemoryTerm(kind, on, share * size) for kind in KINDS[1:] for share in WIDTHS]
 
 
-def filtered(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
+def filter_signal(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
     """Compute the internal state of a term along a signal (N,), from rest at its first value.
 
     A lag is exact for a held input. The others are driven by the increments d of the signal:

@@ -148,7 +148,9 @@ class Suspect:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
             '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
         """
-        text, label, on = written(kind, on, width, lambda text: parse(text, constants), "v[k-1]")
+        text, label, on = suspect_text(
+            kind, on, width, lambda text: parse(text, constants), "v[k-1]"
+        )
         return cls(label if name is None else name, text, output, coefficient, constants or (), on)
 
     @property
@@ -228,7 +230,7 @@ def check_coefficient(suspect: str, coefficient: Any) -> None:
         )
 
 
-def written(
+def suspect_text(
     kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
 ) -> tuple[str, str, str | None]:
     """Return expression and label of a known kind, and its variable in plain spaces.

@@ -12,7 +12,7 @@ from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.problem import Problem
 
 
-def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
+def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
     """Return the suspects of a spec.
 
     A width that is not given is the median size of what the term acts on.
@@ -40,7 +40,9 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
 
 def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
     """Raise InputError for suspects that cannot be read, or have no value on some training row."""
-    suspect_columns(declared(sections, problem), problem.rows.x, problem.layout, problem.outputs)
+    suspect_columns(
+        declare_suspects(sections, problem), problem.rows.x, problem.layout, problem.outputs
+    )
 
 
 def declared_terms(
@@ -52,7 +54,7 @@ def declared_terms(
         InputError: an unknown kind, equation or name, an expression that cannot be read or has no
             value.
     """
-    suspects, (x, u) = [], problem.looked_at
+    suspects, (x, u) = [], problem.guessed_points
     for section in sections:
         kept = ("factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}

@@ -56,9 +56,9 @@ class PageVerdict(NamedTuple):
 def fit_verdict(result: FitResult) -> PageVerdict:
     """Return the verdict of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
-    error, part = _worst(result.scores)
+    error, part = _worst_score(result.scores)
     bad = (
-        _warned(result, _RAN_AWAY)
+        _has_warning(result, _RAN_AWAY)
         or (error is not None and error > _POOR)
         or _code(result) == "hurts"
     )
@@ -72,8 +72,8 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     because = (
         f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
     )
-    first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
-                  if w.code == "one_step_only"), "")  # fmt: skip
+    causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
+    first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
     return PageVerdict(
         level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
     )
@@ -81,7 +81,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
     """Return the verdict of a comparison: which model to use."""
-    rows = [row for row in result.comparison if _worst(row.scores)[0] is not None]
+    rows = [row for row in result.comparison if _worst_score(row.scores)[0] is not None]
     if not rows:
         return PageVerdict(
             "bad",
@@ -89,10 +89,10 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
             "None of them can be used as it is.",
             "Look at the warnings below, and fit again.",
         )
-    errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
+    errors = {row.name: _worst_score(row.scores)[0] or 0.0 for row in rows}
     best = result.chosen or _best_model(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
-    error, part = _worst(row.scores)
+    error, part = _worst_score(row.scores)
     doubts = list(_doubts(row, result.data))
     level = (
         "good"
@@ -106,7 +106,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     same = [name for name in near if percent(errors[name]) == percent(errors[best])]
     near = [name for name in near if name not in same]
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
-    less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
+    less = f", as {'does' if len(same) == 1 else 'do'} {_quote_names(same)}" if same else ""
     less += (
         (", and no other model has a smaller error" if same else ", the smallest of all models")
         if least
@@ -114,7 +114,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     )
     how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
-    trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
+    trust += f"; {_quote_names(near)} {_verb_for(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
@@ -167,12 +167,12 @@ def _word(row: RowResult) -> str:
 
 def _error_text(error: float, part: str) -> str:
     return (
-        f"the RMS error of its free run {_on(part)} is {percent(error)} of the output's "
+        f"the RMS error of its free run {_place_of(part)} is {percent(error)} of the output's "
         "standard deviation"
     )
 
 
-def _on(part: str) -> str:
+def _place_of(part: str) -> str:
     return "on the training data" if part == "train" else f"on {part}"
 
 
@@ -189,7 +189,9 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
     return (found[part], part) if found and found[part] > _WORSE else None
 
 
-def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
+def _worst_score(
+    scores: dict[str, PartScores], kind: str = "simulation"
+) -> tuple[float | None, str]:
     """Return the NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
 
     On the training data where none is held out.
@@ -214,12 +216,12 @@ def _code(result: FitResult | RowResult) -> str | None:
     """
     return (
         None
-        if result.validation is None or _warned(result, "physics_alone")
+        if result.validation is None or _has_warning(result, "physics_alone")
         else result.validation.verdict
     )
 
 
-def _warned(result: FitResult | RowResult, code: str) -> bool:
+def _has_warning(result: FitResult | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
@@ -238,19 +240,19 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         yield "it was not tested on held-out data"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
-    if _warned(result, "spectral_radius_above_one"):
+    if _has_warning(result, "spectral_radius_above_one"):
         yield (
             "its stability is not proved, because the local spectral radius exceeds 1 on a "
             "part of its free run"
         )
-    biased = [row.name for row in _rows(result) if _biased(row)]
+    biased = [row.name for row in _rows(result) if _is_biased(row)]
     if biased:
         one = len(biased) == 1
-        carry = _size_of_bias([row for row in _rows(result) if _biased(row)])
+        carry = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
         guessed = any(
             row.bias and (row.bias.share or 0.0) < SURE_SHARE
             for row in _rows(result)
-            if _biased(row)
+            if _is_biased(row)
         )
         carry = (
             f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
@@ -265,7 +267,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
-    if _warned(result, "closed_loop"):
+    if _has_warning(result, "closed_loop"):
         yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
     if worse is not None:
@@ -314,22 +316,22 @@ def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
     return [*result.parameters, *(physical or [])]
 
 
-def _biased(row: ParameterResult) -> bool:
+def _is_biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
 def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
-    sure = [row.name for row in rows if _known(row)]
+    sure = [row.name for row in rows if _is_known(row)]
     known = sure if _noise_alone(result) else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
-    ahead, part = _worst(result.scores, "prediction")
+    ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
             "Use it only to search for missing physics: the RMS error of its one-step "
-            f"prediction {_on(part)} is {percent(ahead)} of the output's standard deviation, "
+            f"prediction {_place_of(part)} is {percent(ahead)} of the output's standard deviation, "
             "too."
         )
     if level == "bad" and not (known and predicts):
@@ -346,7 +348,7 @@ def _use_text(result: FitResult, level: str) -> str:
             "residual still contains"
         )
     text += (
-        f". {_join(others)} {_is(others)} too uncertain or too biased to be read as physics"
+        f". {_join(others)} {_verb_for(others)} too uncertain or too biased to be read as physics"
         if others
         else ""
     )
@@ -364,17 +366,17 @@ def _noise_alone(result: FitResult) -> bool:
     )
 
 
-def _known(row: ParameterResult) -> bool:
+def _is_known(row: ParameterResult) -> bool:
     """Return whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
-    return sure and not row.shared and not _biased(row)
+    return sure and not row.shared and not _is_biased(row)
 
 
-def _quoted(names: list[str]) -> str:
+def _quote_names(names: list[str]) -> str:
     return _join([f"“{name}”" for name in names])
 
 
-def _is(names: list[str]) -> str:
+def _verb_for(names: list[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
@@ -406,7 +408,7 @@ def _option(result: FitResult) -> str | None:
         return (
             'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
         )
-    predicted = None if result.advice_trials is not None else _predicted(result)
+    predicted = None if result.advice_trials is not None else _predicted_change(result)
     if predicted is not None:
         return predicted
     if not result.data.tests and not result.data.validation:
@@ -421,14 +423,14 @@ def _option(result: FitResult) -> str | None:
         return (
             f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
         )
-    if _warned(result, _RAN_AWAY):
+    if _has_warning(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
-    if _warned(result, "closed_loop"):
+    if _has_warning(result, "closed_loop"):
         return (
             "data with the reference recorded, with larger motions of the reference, or "
             "without the controller"
         )
-    if _undecided(result):
+    if _is_undecided(result):
         return (
             "the learner (`training.fallback = false`), because cross-validation does not "
             "decide whether it helps"
@@ -452,9 +454,9 @@ def _option(result: FitResult) -> str | None:
     )
 
 
-def _predicted(result: FitResult) -> str | None:
+def _predicted_change(result: FitResult) -> str | None:
     """Return the change with the largest predicted gain, where none was tried."""
-    causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
+    causes = [row.bias for row in _rows(result) if _is_biased(row) and row.bias]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
     missing = (
         result.residuals.missing.terms if result.residuals and result.residuals.missing else []
@@ -481,11 +483,11 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
     return f"“{cause.cause}” in the physics, because {percent(cause.share)} of {what} {looks}"
 
 
-def _undecided(result: FitResult) -> bool:
+def _is_undecided(result: FitResult) -> bool:
     """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
     return (
-        _warned(result, "physics_alone")
+        _has_warning(result, "physics_alone")
         and ratio is not None
         and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
     )
