@@ -559,8 +559,8 @@ def _relative_clause(better: int, tried: int) -> str:
         return "which improves it" if better else "which does not improve it"
     return (
         "of which "
-        f"{'none improves' if not better else 'one improves' if better == 1 else f'{better} improve'} "
-        "it"
+        f"{'none' if not better else 'one' if better == 1 else better} "
+        f"{'improve' if better > 1 else 'improves'} it"
     )
 
 

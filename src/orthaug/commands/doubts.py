@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 _LISTED = 3  # parameters, and terms with memory
 _DETERMINED = re.compile(
-    r"( The data determine | Of the physical parameters they determine )[^.]*\.|: the data determine [^.]*"
+    r"( The data determine | Of the physical parameters they determine )[^.]*\."
+    r"|: the data determine [^.]*"
 )
 
 
