@@ -30,6 +30,7 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
         output = section.output if section.output is not None else only
         options = {
             "width": width,
+            "time_constant": section.time_constant,
             "output": output,
             "coefficient": section.coefficient,
             "name": section.name,
@@ -40,7 +41,8 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
 
 def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
     """Raise InputError for suspects that cannot be read, or have no value on some training row."""
-    suspect_columns(declared(sections, problem), problem.rows.x, problem.layout, problem.outputs)
+    own = (problem.rows.x, problem.layout, problem.outputs, problem.lengths)
+    suspect_columns(declared(sections, problem), *own)
 
 
 def declared_terms(
@@ -54,7 +56,7 @@ def declared_terms(
     """
     suspects, (x, u) = [], problem.looked_at
     for section in sections:
-        kept = ("factor", "equation", "coefficient", "unit", "name")
+        kept = ("time_constant", "factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}
         width = _width(section, lambda on: motion_width(on, problem.motion, x.T, u.T))
         suspects.append(MotionSuspect.of(section.kind, section.on, width=width, **options))
