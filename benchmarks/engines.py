@@ -26,7 +26,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.models.cluster import Dask, connected
+from orthaug.models.cluster import Dask, connect
 from orthaug.models.rows import InMemory
 from orthaug.models.streaming import Stream
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
@@ -197,7 +197,7 @@ def on_a_cluster(folder: Path) -> dict[str, float]:
     """A pass on two workers over the same in memory, on one over one thread, and what an iteration costs beside it."""
     source, told = opened(folder / "1000000.parquet", GROUP), {}
     for workers in (2, 1):
-        client = connected(None, workers)
+        client = connect(None, workers)
         try:
             engine = Dask(client)
             problem = posed(source, engine)
@@ -262,7 +262,7 @@ def costs(folder: Path) -> Costs:
         size=(85, 85)
     )  # 81 weights, the residual and 3 parameters
     add = fastest(lambda: [part + part for _ in range(1000)], 3) / 1000
-    client = connected(None, 2)
+    client = connect(None, 2)
     try:
         numbers = range(2000)
         task = fastest(lambda: client.gather(client.map(abs, numbers, pure=False)), 3) / len(

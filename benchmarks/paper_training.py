@@ -18,7 +18,7 @@ from machine import describe
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.structures import Additive, Structure
 from orthaug.studies import published
-from orthaug.studies.common import ORTHOGONAL, STRUCTURES, trained
+from orthaug.studies.common import ORTHOGONAL, STRUCTURES, train
 from orthaug.studies.synthetic import static
 
 STARTS = 10
@@ -82,7 +82,7 @@ def levenberg() -> list[list[float]]:
     for iterations in ITERATIONS:
         orthogonal, additive = (
             over_starts(
-                lambda seed, s=structure, i=iterations: trained(
+                lambda seed, s=structure, i=iterations: train(
                     EXAMPLE, "static", "ours", structure=s, seed=seed, iterations=i
                 )
             ).mean(axis=0)

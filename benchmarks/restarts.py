@@ -14,7 +14,7 @@ from orthaug import MLP, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.compiled import Options, _advance, _begun, linearise
+from orthaug.fitting.solvers.compiled import Options, _advance, _first_state, linearise
 from orthaug.models.rows import Overlap
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic
@@ -46,7 +46,9 @@ def main() -> None:
             ws: object, criterion=criterion, arguments=arguments, overlap=overlap, options=options
         ) -> object:
             def one(w: object) -> object:
-                state = _begun(w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0))
+                state = _first_state(
+                    w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0)
+                )
                 return _advance(criterion, state, arguments, options, jnp.asarray(ITERATIONS))
 
             return jax.vmap(one)(ws)  # noqa: B023

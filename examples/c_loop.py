@@ -4,7 +4,7 @@
 
 Exports the paper's mass-spring-damper with its network, compiles it without a warning as C99, runs a free run sample by
 sample in double and in single precision, and compares both with `simulate`. With arm-none-eabi-gcc it also compiles for
-a Cortex-M4 and tells the size. Needs gcc.
+a Cortex-M4 and prints the size. Needs gcc.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def for_arm(folder: Path) -> str:
     subprocess.run(
         [compiler, *STRICT, *CORTEX_M4, "-c", "plant.c", "-o", "plant.o"], cwd=folder, check=True
     )
-    told = subprocess.run([size, "plant.o"], cwd=folder, check=True, capture_output=True, text=True)
-    text, data, bss = told.stdout.splitlines()[1].split()[:3]
+    done = subprocess.run([size, "plant.o"], cwd=folder, check=True, capture_output=True, text=True)
+    text, data, bss = done.stdout.splitlines()[1].split()[:3]
     return f"Cortex-M4, single precision: {text} bytes of code and constants, {int(data) + int(bss)} of data"
 
 

@@ -3,7 +3,7 @@
     python examples/generate.py [folder]        writes generated/*.csv beside this file, or into the folder
 
 Each record is the fine integration of equations that the spec knows in part, with noise on the measured outputs and a
-seed of its own. What the parameters truly are stands here, so that the estimates can be held against it.
+seed of its own. The true parameters are here, so that the estimates can be held against it.
 """
 
 from __future__ import annotations

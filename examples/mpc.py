@@ -2,9 +2,9 @@
 
     python examples/mpc.py [figure.png]
 
-Both models are fitted to the same record, written as CasADi functions by `oa.export`, and stand in the same optimal
+Both models are fitted to the same record, written as CasADi functions by `oa.export`, and are used in the same optimal
 control problem: horizon, weights, limits and solver (IPOPT) are the same, and neither integrates the tracking error.
-The plant is integrated finely; its friction has a static peak (Stribeck), which neither model is told. Needs casadi and
+The plant is integrated finely; its friction has a static peak (Stribeck), which neither model contains. Needs casadi and
 matplotlib.
 """
 

@@ -45,8 +45,10 @@ def main() -> dict[str, np.ndarray]:
         fit = oa.estimate(data, BASELINE, learner=None, criterion=criterion)
         physical = fit.physical(PHYSICS)
         rows = zip(physical.names, physical.value, physical.std, strict=True)
-        told = ", ".join(f"{parameter} = {value:.5g} ± {std:.2g}" for parameter, value, std in rows)
-        print(f"{name}: {told}\n  {oa.diagnose(fit).text}")
+        listed = ", ".join(
+            f"{parameter} = {value:.5g} ± {std:.2g}" for parameter, value, std in rows
+        )
+        print(f"{name}: {listed}\n  {oa.diagnose(fit).text}")
         found[name] = physical.value
     return found
 

@@ -32,6 +32,10 @@ os.environ.setdefault("NPROC", "1")
 # Where in the source each operation was written is not looked up for the compiler.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
+import jax  # noqa: E402  (it reads the settings above when it is imported)
+
+jax.config.update("jax_enable_x64", True)  # for arrays that tests make before the program does
+
 settings.register_profile(
     "orthaug",
     derandomize=True,
@@ -53,7 +57,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 # Half a minute or more each: a worker that took one of these files last would be waited for.
 _LONGEST = """
-app documents engines motion_fit report_browser cli export reproduction motion_cli free_run scikit_learn published
+golden golden_motion golden_examples app documents engines motion_fit report_browser cli export reproduction motion_cli free_run scikit_learn published
 """
 
 
@@ -114,6 +118,23 @@ def data_folder() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data sets in {folder}; set ORTHAUG_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def golden_records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The records of the golden specs, written once."""
+    from golden_records import write_data
+
+    folder = tmp_path_factory.mktemp("golden")
+    write_data(folder)
+    return folder
+
+
+@pytest.fixture
+def golden_folder(golden_records: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the golden records, as the current one."""
+    monkeypatch.chdir(golden_records)
+    return golden_records
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ import given
 import tomlkit
 from test_cli import run
 
-from orthaug.commands.kinds import open_job
+import orthaug
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMENT = re.compile(r"<!-- (given|not run): (.+?) -->|<!-- exit (\d+) -->")
@@ -166,7 +166,7 @@ def opened(text: str) -> None:
         whole.pop(name, None)
     path = Path("spec.toml")
     path.write_text(tomlkit.dumps({**whole, **part, "data": data}), encoding="utf-8")
-    open_job(path)
+    orthaug.load_spec(path)
 
 
 class Page:
@@ -182,7 +182,7 @@ class Page:
         given.give(block.given, self.names)
         if block.language == "toml" and block.title:
             Path(block.title).write_text(block.text, encoding="utf-8")
-            open_job(Path(block.title))
+            orthaug.load_spec(Path(block.title))
         elif block.language == "toml":
             opened(block.text)
         elif block.language == "python" and block.title:

@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 from plain_readers import NAMES, plain
 
-from orthaug._base.errors import InputError
-from orthaug.data.readers import read_record
+from orthaug import InputError, read_record
 
 ROWS = 24
 TYPES = ("csv", "semicolons.csv", "tsv", "xlsx", "parquet", "npz", "v5.mat", "v73.mat", "h5")
@@ -372,7 +371,7 @@ blocks = 3
 def model_files(folder: Path) -> dict[str, bytes]:
     """A small fitted model as it is saved."""
     import orthaug as oa
-    from orthaug.data.record import Channel
+    from orthaug import Channel
 
     u, y = signals()
     record = oa.Record.from_arrays(u, y, outputs=[Channel("y", "m")])

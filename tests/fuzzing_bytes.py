@@ -14,7 +14,7 @@ from typing import Any
 import fuzzing
 from safetensors.numpy import load as load_arrays
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.data.expressions import parse_named
 from orthaug.data.tables import column_names
 from orthaug.models import storage

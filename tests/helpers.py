@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.models.learners import Bound, Learner
 from orthaug.models.rows import Chunk, Overlap, chunk_shape, in_chunks

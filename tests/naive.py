@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug.data.record import Experiment, Record
-from orthaug.models.learners import MLP
-from orthaug.models.model import Model
+from orthaug import MLP, Experiment, Model, Record
 
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "abs", "sign", "tanh")}
 

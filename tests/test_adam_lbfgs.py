@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Function,
+    InputError,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers import adam_lbfgs
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Function
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(0.5), BaselinePenalty(0.5))

@@ -23,20 +23,20 @@ import numpy as np
 import pytest
 from test_cli import run, signals, write_csv
 
-from orthaug._base.errors import InputError
+from orthaug import InputError, load_spec
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
-from orthaug.commands.app.worker import thinned
+from orthaug.commands.app.worker import thin_curve
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
-from orthaug.commands.kinds import open_job
-from orthaug.commands.parts import expanded
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
 HAS_PAGE = importlib.util.find_spec("nicegui") is not None
+if HAS_PAGE:
+    from orthaug.commands.app import routes
 HAS_BROWSER = importlib.util.find_spec("playwright") is not None and CHROMIUM is not None
 served = pytest.mark.skipif(not HAS_PAGE or os.name != "posix", reason="no NiceGUI, or no SIGINT")
 browsed = pytest.mark.skipif(
@@ -46,8 +46,8 @@ browsed = pytest.mark.skipif(
 MAIN = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the background may have inherited none
-from orthaug.commands.entry import main
-main()
+import runpy
+runpy.run_module("orthaug", run_name="__main__")
 """
 LATE = 90_000  # ms
 SPEC = """# kept
@@ -185,29 +185,37 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     assert "unit" not in spec_text.as_motion(SPEC)
 
 
+def trained_on(folder: Path, pattern: str) -> list[str]:
+    """The files, from the folder of the spec, that a spec with this in the place of a file reads."""
+    spec = folder / "spec.toml"
+    spec.write_text(SPEC[: SPEC.index("tests.one")].replace('"run.csv", "/there/b.csv"', f'"{pattern}"')
+                    + SPEC[SPEC.index("[[baseline") :])  # fmt: skip
+    return [file.file for file in load_spec(spec).train.files]
+
+
 def test_a_file_whose_name_looks_like_a_pattern_is_found(tmp_path):
-    (tmp_path / "run [1].csv").touch()
-    assert expanded(tmp_path / "spec.toml", ["run [1].csv"], "train") == ["run [1].csv"]
+    write_csv(tmp_path / "run [1].csv", **dict(zip("uy", signals(20, 1), strict=True)))
+    assert trained_on(tmp_path, "run [1].csv") == ["run [1].csv"]
 
 
 def test_a_text_beside_tables_is_a_note(tmp_path):
-    for name in ("a.csv", "b.csv", "notes.txt", "c.dat", "plot.png"):
-        (tmp_path / name).touch()
+    columns = dict(zip("uy", signals(20, 1), strict=True))
     (tmp_path / "plain").mkdir()
-    for name in ("a.txt", "b.dat"):
-        (tmp_path / "plain" / name).touch()
-    assert expanded(tmp_path / "spec.toml", ["."], "train") == ["./a.csv", "./b.csv"]
-    assert expanded(tmp_path / "spec.toml", ["plain"], "train") == ["plain/a.txt", "plain/b.dat"]
+    for name in ("a.csv", "b.csv", "notes.txt", "c.dat", "plain/a.txt", "plain/b.dat"):
+        write_csv(tmp_path / name, **columns)
+    (tmp_path / "plot.png").touch()
+    assert trained_on(tmp_path, ".") == ["./a.csv", "./b.csv"]
+    assert trained_on(tmp_path, "plain") == ["plain/a.txt", "plain/b.dat"]
 
 
 def test_a_curve_is_thinned_to_what_is_seen():
     x = np.arange(100_000.0)
     y = np.sin(x / 1e4)
     y[31_234], y[77:90] = 5.0, np.nan
-    drawn = thinned(x, y)
+    drawn = thin_curve(x, y)
     assert len(drawn["x"]) <= 3000 and max(v for v in drawn["y"] if v is not None) == 5.0
     assert drawn["x"] == sorted(drawn["x"])  # type: ignore[type-var]
-    assert thinned(x[77:200], y[77:200])["y"][:13] == [None] * 13
+    assert thin_curve(x[77:200], y[77:200])["y"][:13] == [None] * 13
 
 
 def test_the_address_in_the_browsers_arguments_opens_the_page_once():
@@ -242,11 +250,9 @@ def test_each_dropped_file_keeps_its_content(tmp_path):
     assert (tmp_path / "run.csv").read_text() == "first"
 
 
+@served
 def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatch):
     from starlette.requests import Request
-
-    from orthaug.commands.app import routes
-    from orthaug.commands.app.session import Sessions
 
     monkeypatch.setattr(routes, "LARGEST", 10)
     sessions = Sessions(tmp_path)
@@ -266,7 +272,9 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
             "path": "/",
             "query_string": b"",
         }
-        reply = asyncio.run(routes._kept(sessions, session.key, "run.csv", Request(scope, receive)))  # type: ignore
+        reply = asyncio.run(
+            routes._keep_upload(sessions, session.key, "run.csv", Request(scope, receive))
+        )  # type: ignore
         return reply.status_code, bytes(reply.body).decode()
 
     for code, text in (dropped(b"x" * 40), dropped(b"", **{"content-length": "11"})):
@@ -302,8 +310,8 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
         '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\ninitial = 0.5\n'
         "[learner]\nhidden = [4]\n[training]\nrestarts = 2\n"
     )
-    job = open_job(tmp_path / "spec.toml")
-    runs = job.planned(AS_DECLARED)
+    job = load_spec(tmp_path / "spec.toml")
+    runs = job.plan_of(AS_DECLARED)
     assert [tuple(run.values()) for run in runs] == [
         *(
             ("orthogonal", 1, "none"),
@@ -312,10 +320,10 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
             ("orthogonal", 2, "ard"),
         )
     ]
-    assert len(runs) == job.run_count and job.planned(Variant(PHYSICS_ONLY)) == (
+    assert len(runs) == job.run_count and job.plan_of(Variant(PHYSICS_ONLY)) == (
         {"structure": PHYSICS_ONLY},
     )
-    penalised = job.planned(Variant("baseline-penalty"))
+    penalised = job.plan_of(Variant("baseline-penalty"))
     assert {run["structure"] for run in penalised} == {"baseline-penalty"} and len(penalised) == 4
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
     monkeypatch.setattr("orthaug.commands.bars._OFTEN", 0.0)
@@ -378,16 +386,14 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
 
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
-    from orthaug.commands.app.routes import Page
-
     session = Session("key", tmp_path, WorkerPool())
-    page, told, seen = Page(session), [], []
+    page, told, seen = routes.Page(session), [], []
     monkeypatch.setattr(page, "_complain", told.append)
     monkeypatch.setattr(page, "_name", lambda: None)
     monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)
     monkeypatch.setattr(page.model, "follow_data", lambda: seen.append("model"))
     monkeypatch.setattr(page.training, "follow_work", lambda: seen.append("training"))
-    session.changed("data")
+    session.mark_changed("data")
     page.follow()
     assert [type(error) for error in told] == [ZeroDivisionError] and seen == ["model", "training"]
     page.follow()
@@ -406,9 +412,9 @@ def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
         await session.desk.close()
         return session.trouble
 
-    monkeypatch.setattr("orthaug.commands.app.processes._started", refused)
+    monkeypatch.setattr("orthaug.commands.app.processes._start_worker", refused)
     assert asyncio.run(looked()) == "no process can be started (Resource temporarily unavailable)."
-    monkeypatch.setattr("orthaug.commands.app.session.Session.worded", lambda *_: 1 / 0)
+    monkeypatch.setattr("orthaug.commands.app.session.Session.reword", lambda *_: 1 / 0)
     assert asyncio.run(failed(tmp_path)) == "this did not work (ZeroDivisionError)."
 
 
@@ -443,7 +449,7 @@ def test_a_question_that_is_taken_back_leaves_its_process_to_the_next(tmp_path, 
                 await desk.ask("look")
             assert started == starts
 
-    monkeypatch.setattr("orthaug.commands.app.processes._started", counted)
+    monkeypatch.setattr("orthaug.commands.app.processes._start_worker", counted)
     asyncio.run(twice())
 
 
@@ -603,7 +609,10 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     assert session.found is not None and session.data is not None
     assert view._whole_file()[0] == "motor_test.csv"  # nothing was checked yet
     view._take_uses(session.found)
-    assert view.uses == {"left": "input", "right": "output"} and view._lacking(session.found) == []
+    assert (
+        view.uses == {"left": "input", "right": "output"}
+        and view._missing_columns(session.found) == []
+    )
     session.checked = {"files": [str(session.folder / "motor_train.csv")]}
     assert view._whole_file() == (
         "motor_train.csv",
@@ -611,13 +620,13 @@ def test_the_channels_and_the_grey_curves_are_those_of_the_spec(started):
     )
     session.raw.clear()
     assert view._whole_file() == ("", {})
-    assert export._beside() == ["motor_train.csv"]
+    assert export._uploaded_files() == ["motor_train.csv"]
     session.spec = spec_text.with_value(
         session.spec, ("data", "tests", "a"), {"files": ["motor_test.csv", "/b.csv"]}
     )
-    assert export._beside() == ["motor_train.csv", "motor_test.csv"]
+    assert export._uploaded_files() == ["motor_train.csv", "motor_test.csv"]
     session.spec = session.spec.replace('"left"', '"up"')
-    assert view._lacking(session.found) == ["up"]
+    assert view._missing_columns(session.found) == ["up"]
     view._drawn = (None, None, False)
     view._take_uses(session.found)
     assert view.uses == {"left": "", "right": ""}

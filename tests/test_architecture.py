@@ -49,7 +49,7 @@ UNSAFE_MODULES = (
     "shelve",
 )
 UNSAFE_CALLS = ("eval", "exec", "read_pickle", "to_pickle")
-MOST_NAMES = 17  # of a room's face
+MOST_NAMES = 12  # of a room's face
 ENTRIES = {
     "studies.": "a study is an entry of `orthaug reproduce`",
     "export.": "a target is an entry of `orthaug export --to`",

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
-from orthaug.data.expressions import Lag
-from orthaug.physics.baseline import Baseline, Parameter, Term
+from orthaug import Baseline, InputError, Parameter, Term
 
-LAYOUT = (Lag("y", 1), Lag("y", 2), Lag("u", 1))
+
+def reading(*texts: str) -> Baseline:
+    """A baseline with a term for each of these texts."""
+    return Baseline.from_terms([Term(f"t{i}", text, output="y") for i, text in enumerate(texts)])
+
+
+LAYOUT = reading("y[k-1]", "y[k-2]", "u[k-1]").lags
 X = np.random.default_rng(1).normal(size=(5, 3))
 Y1, Y2, U1 = X.T
 
@@ -26,7 +31,7 @@ def test_phi_of_terms(xp):
     assert baseline.names == ("a", "b", "c")
     assert baseline.parameters[0] == Parameter("a", 0.5, "1")
     np.testing.assert_array_equal(baseline.initial, [0.5, 0.0, 0.0])
-    assert baseline.lags == (Lag("y", 1), Lag("u", 1))
+    assert [str(lag) for lag in baseline.lags] == ["y[k-1]", "u[k-1]"]
     phi = baseline.phi(xp.asarray(X), LAYOUT, ("y",), xp)
     expected = np.stack([Y1, np.sign(U1) * U1**2, np.ones(5)], axis=1)[:, None]
     np.testing.assert_allclose(phi, expected, rtol=1e-15)
@@ -42,7 +47,7 @@ def test_phi_in_compiled_code():
 
 
 def test_outputs_share_a_parameter():
-    layout = (Lag("p", 1), Lag("q", 1))
+    layout = reading("p[k-1]", "q[k-1]").lags
     terms = [
         Term("a", "p[k-1]", output="p"),
         Term("shared", "q[k-1]", output="p"),

@@ -10,17 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError, RankError
+from orthaug import InputError, RankError, Record, Suspect, estimate, synthetic
 from orthaug.analysis.bias import Certificate, bias_table, find_certificate
-from orthaug.analysis.suspects import Suspect, data_width, suspect_columns
-from orthaug.data.record import Record
-from orthaug.physics.problem import pose
+from orthaug.analysis.suspects import data_width, suspect_columns
 from orthaug.physics.projection import Projection
-from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static
 
 TS = {"Ts": 0.01}
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
-SYSTEM = MassSpringDamper()
+SYSTEM = synthetic.MassSpringDamper()
 THETA = SYSTEM.paper_theta()
 FRICTION = Suspect(
     "friction",
@@ -33,9 +30,9 @@ ANY = Suspect("any", "1")
 
 @pytest.fixture(scope="module")
 def machine():
-    """The posed problem of the paper's record."""
-    example = mass_spring_damper()
-    return pose(example.train, example.baseline)
+    """The problem of the paper's record."""
+    example = synthetic.mass_spring_damper()
+    return estimate(example.train, example.baseline, learner=None).problem
 
 
 def table(problem, suspects, **more) -> Any:
@@ -60,9 +57,9 @@ def single(phi, delta) -> Any:
 
 def simulated(noise=None, friction=True):
     """The paper's training record with or without noise and friction, and the rows that it gives."""
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     force = example.train.experiments[0].inputs[:, 0]
-    system = SYSTEM if friction else MassSpringDamper(coulomb=0.0, static=0.0)
+    system = SYSTEM if friction else synthetic.MassSpringDamper(coulomb=0.0, static=0.0)
     record = Record.from_arrays(
         force,
         system.simulate(force, THETA, noise),
@@ -70,7 +67,7 @@ def simulated(noise=None, friction=True):
         inputs=["force"],
         outputs=["position"],
     )
-    return pose(record, example.baseline)
+    return estimate(record, example.baseline, learner=None).problem
 
 
 def paper_noise():
@@ -103,8 +100,8 @@ def test_friction_and_noise_explain_the_whole_error(machine):
 
 
 def test_the_error_of_the_papers_data_set_3_is_predicted():
-    example = static(3)
-    problem = pose(example.train, example.baseline)
+    example = synthetic.static(3)
+    problem = estimate(example.train, example.baseline, learner=None).problem
     (found,) = table(problem, [Suspect("rest", "0.01 - 0.5*u[k]**2", coefficient=1.0)])
     assert np.linalg.norm(found.expected) == pytest.approx(0.1433, abs=1e-4)
     np.testing.assert_allclose(
@@ -113,8 +110,8 @@ def test_the_error_of_the_papers_data_set_3_is_predicted():
 
 
 def test_an_even_term_biases_nothing_under_a_symmetric_measure():
-    example = static(1)
-    problem = pose(example.train, example.baseline)
+    example = synthetic.static(1)
+    problem = estimate(example.train, example.baseline, learner=None).problem
     (found,) = table(problem, [Suspect("square", "u[k]**2")])
     assert np.abs(found.bias).max() < 1e-14 and found.cosine < 1e-14
     assert found.certificate == Certificate("removable")

@@ -10,16 +10,20 @@ from scipy.signal import lfilter
 from test_initial_states import FED_BACK, eliminated, start_rows, states_of
 from test_segments import CASES, assert_close, case, dense, found_of
 
-from orthaug._base.errors import InputError
+from orthaug import (
+    Baseline,
+    InputError,
+    Record,
+    Simulation,
+    Symmetrized,
+    Term,
+    Training,
+    estimate,
+    prediction_std,
+)
 from orthaug.analysis.robustness import robust_where_asked
-from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.colour import correlation_length
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.inference.covariance import prediction_std
-from orthaug.inference.measures import Symmetrized, Training
-from orthaug.physics.baseline import Baseline, Term
 
 THETA = np.array([1.5, -0.7, 0.3, 0.2])
 PHYSICS = Baseline.from_terms(

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 from test_cli import run
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Function,
+    InputError,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Prediction,
+    Record,
+    Simulation,
+    Term,
+    estimate,
+    load_spec,
+    prediction_std,
+)
 from orthaug.analysis.imitation import imitation
-from orthaug.commands.spec import load_spec
-from orthaug.data.record import Record
-from orthaug.fitting.criteria import Prediction, Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.inference.covariance import prediction_std
-from orthaug.models.learners import MLP, Function
-from orthaug.physics.baseline import Baseline, Term
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -527,7 +535,7 @@ def project(folder, spec=SPEC):
 
 
 def test_a_spec_carries_bounds(tmp_path):
-    baseline = load_spec(project(tmp_path)).declared_baseline()
+    baseline = load_spec(project(tmp_path)).problem.baseline
     np.testing.assert_array_equal(baseline.bounds, [[0.0, -np.inf, 0.1], [0.8, np.inf, np.inf]])
 
 

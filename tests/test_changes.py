@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from orthaug import MLP, Baseline, Lags, LevenbergMarquardt, Record, Simulation, Term, estimate
 from orthaug.analysis.changes import Candidates, Change, model_changes
 from orthaug.analysis.predictability import BlockSums, from_lags, from_own_past, predictable
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 CUBIC = Baseline.from_terms([*PHYSICS.terms, Term("c", "y[k-1]**3")])

@@ -10,23 +10,18 @@ from functools import partial
 import numpy as np
 import pytest
 from safetensors.numpy import load, save
+from test_cli import run
 from test_engine import Streaming, posed
 from test_engines import BASELINE, FLIGHT, SPEC, fitted, folder, from_files  # noqa: F401  (a fixture)
-from typer.testing import CliRunner
 
 import orthaug as oa
+from orthaug import MLP, BaselinePenalty, LevenbergMarquardt, Orthogonal, Stream
 from orthaug._base.folders import PARTIALS
 from orthaug._base.progress import Progress
-from orthaug.commands.cli import app
 from orthaug.commands.fit import fit_job, keep_states, write_result
-from orthaug.commands.kinds import open_job
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.estimation import fit
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import BaselinePenalty, Orthogonal
-from orthaug.models.learners import MLP
 from orthaug.models.rows import InMemory
-from orthaug.models.streaming import Stream
 from orthaug.physics.problem import pose
 
 
@@ -240,19 +235,18 @@ def test_a_command_that_was_killed_goes_on(folder, tmp_path, without_figures):  
     path.write_text(f"{text}checkpoint = 0.0\n", encoding="utf-8")
     out = tmp_path / "out"
     with pytest.raises(Killed):
-        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(oa.load_spec(path), out), Progress(dies_at(5)))
     assert (tmp_path / "out.training" / "training.json").exists()
     assert tmp_path / "out.training" in PARTIALS.placed, "Ctrl-C names it"
-    run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--resume"])
-    assert run.exit_code == 0, run.output
+    done = run("fit", path, "--out", out, "--resume")
+    assert done.code == 0, done.err
     assert not (tmp_path / "out.training").exists() and (out / "result.json").exists()
     model = oa.load(out / "model")
     assert [p["value"] for p in expected["parameters"]] == list(model.theta)
     with pytest.raises(Killed):
-        fit_job(keep_states(open_job(path), out), Progress(dies_at(5)))
+        fit_job(keep_states(oa.load_spec(path), out), Progress(dies_at(5)))
     path.write_text(f"{text}checkpoint = 1.0\n", encoding="utf-8")
-    run = CliRunner().invoke(app, ["fit", str(path), "--out", str(out), "--force", "--resume"])
-    assert run.exit_code == 2 or isinstance(run.exception, oa.InputError)
-    fitted_again = fit_job(keep_states(open_job(path), out))
+    assert run("fit", path, "--out", out, "--force", "--resume").code == 2
+    fitted_again = fit_job(keep_states(oa.load_spec(path), out))
     write_result(fitted_again, out, force=True)
     assert not (tmp_path / "out.training").exists()

@@ -7,8 +7,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from orthaug import InputError
 from orthaug._base.checks import check_number, finite_or_none, is_number
-from orthaug._base.errors import InputError
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ import pytest
 from test_cli import MAIN, SPEC, make_project, one_line, run, signals, write_csv
 from test_cli import MLP as NETWORK
 
-from orthaug.models.storage import load, save
+from orthaug import load, save
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.stats
 from test_cli import MLP, SPEC, finite_json, make_project, one_line, run, write_csv
 
-from orthaug import load_spec
-from orthaug.inference.covariance import interval
-from orthaug.models.storage import load
-from orthaug.studies.synthetic import MassSpringDamper
+from orthaug import load, load_spec, synthetic
 
 TRUE = {"m": 1.0, "cd": 100.0, "ks": 1000.0}
-SYSTEM = MassSpringDamper()
+SYSTEM = synthetic.MassSpringDamper()
 GAMMA = "(m + cd*Ts + ks*Ts**2)"
 TERMS = """
 [data]
@@ -67,7 +65,7 @@ def machine(
     """A spec and its record of a mass, a spring and a damper; returns the spec's path."""
     rng = np.random.default_rng(4)
     force = rng.uniform(-100, 100, 1500)
-    system = SYSTEM if friction else MassSpringDamper(coulomb=0.0, static=0.0)
+    system = SYSTEM if friction else synthetic.MassSpringDamper(coulomb=0.0, static=0.0)
     position = system.simulate(force, euler(**TRUE, sign=sign), noise * rng.normal(size=1498))
     write_csv(folder / "run.csv", force=force, position=position)
     (folder / "machine.toml").write_text(spec)
@@ -123,7 +121,7 @@ def test_physical_parameters_with_intervals(plain):
     for row in rows:
         assert row["value"] == pytest.approx(TRUE[row["name"]], abs=4 * row["std"])
         assert 0 < row["std"] < 1e-2 * row["value"]
-        expected = interval(np.array([row["value"]]), np.array([row["std"]]), 1498 - 3)[0]
+        expected = scipy.stats.t(1498 - 3, row["value"], row["std"]).interval(0.95)
         np.testing.assert_allclose(row["ci95"], expected, rtol=1e-9)
     assert result["physical_consistency"] is None and result["warnings"] == []
 

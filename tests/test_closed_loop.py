@@ -9,8 +9,8 @@ import pytest
 import scipy.signal as ss
 from test_cli import run, write_csv
 
+from orthaug import Record
 from orthaug.analysis.closed_loop import closed_loop, feedback_in
-from orthaug.data.record import Record
 
 ROWS = 1500
 

@@ -8,21 +8,27 @@ from __future__ import annotations
 from functools import cache
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.models.learners import MLP, EquinoxModule, Function
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    EquinoxModule,
+    Function,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    Record,
+    Term,
+    estimate,
+    orthogonalize,
+)
 
 REGRESSORS = {
     1: ("y[k-1]", "u[k]", "u[k-1]", "1", "y[k-1]**3", "sin(2*u[k])", "y[k-1]*u[k-1]", "abs(u[k])"),
@@ -220,9 +226,7 @@ def test_every_combination(structure, regularization, ny, learner):
         )
         for _ in range(2)
     )
-    codes = {ending.code for ending in Ending}
-    assert first.status.code in codes
-    assert codes == {"converged", "iteration_limit", "no_descent", "non_finite", "exact", "stopped"}
+    assert first.status.code in ("converged", "iteration_limit", "no_descent", "exact")
     assert (first.status.code == "exact") == (learner == "none")
     assert np.isfinite(first.status.loss) and 0 <= first.status.loss < 1
     assert np.isfinite(first.theta).all() and np.isfinite(first.model.numbers.weights).all()

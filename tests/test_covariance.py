@@ -9,13 +9,8 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term, estimate, synthetic
 from orthaug.inference.covariance import interval, noise_covariance
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.studies.synthetic import NOISE_30_DB, static
 
 ROWS = 60
 U = np.random.default_rng(0).normal(size=(ROWS, 3)) * [1.0, 1e-3, 50.0]
@@ -40,7 +35,7 @@ def single():
 
 @pytest.fixture(scope="module")
 def network():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(
         example.train,
         example.baseline,
@@ -79,7 +74,9 @@ def test_a_learner_uses_up_freedom(network):
     expected = np.sqrt(np.diag(np.sum(residual**2) / freedom * np.linalg.inv(phi.T @ phi)))
     np.testing.assert_allclose(network.std, expected, rtol=1e-9)
     assert network.freedom == pytest.approx(freedom) and network.effective_weights > 1
-    assert np.sqrt(network.model.statistics.noise[0, 0]) == pytest.approx(NOISE_30_DB, rel=0.05)
+    assert np.sqrt(network.model.statistics.noise[0, 0]) == pytest.approx(
+        synthetic.NOISE_30_DB, rel=0.05
+    )
 
 
 NIST = {
@@ -193,14 +190,14 @@ def test_coverage_of_the_intervals(network, record_property):
     coverage, the share of N(0, σ²(ΦᵀΦ)⁻¹) in it. Its mean over 100 draws has a standard deviation of 0.05 %, that of
     the share counted 2.2 %.
     """
-    example = static(1)
+    example = synthetic.static(1)
     (clean,) = example.train.experiments
     rng = np.random.default_rng(0)
     phi = clean.inputs ** [1, 3]
-    true = NOISE_30_DB * np.sqrt(np.diag(np.linalg.inv(phi.T @ phi)))
+    true = synthetic.NOISE_30_DB * np.sqrt(np.diag(np.linalg.inv(phi.T @ phi)))
     inside, covered, draws = np.zeros(2), np.zeros(2), 100
     for _ in range(draws):
-        e = rng.normal(scale=NOISE_30_DB, size=(1024, 1))
+        e = rng.normal(scale=synthetic.NOISE_30_DB, size=(1024, 1))
         record = Record.from_arrays(clean.inputs, clean.outputs + e)
         fit = estimate(
             record, example.baseline, initial=network, regularization="evidence", solver=SOLVER

@@ -7,18 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import Baseline, InputError, Suspect, Term, design_input, synthetic
 from orthaug.analysis import signals
-from orthaug.analysis.bias import bias_table
-from orthaug.analysis.design import Design, design_input
-from orthaug.analysis.suspects import Suspect, suspect_columns
-from orthaug.data.record import Record
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.problem import pose
+from orthaug.analysis.design import Design
 from orthaug.reports.result import DesignResult
-from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper
 
-SYSTEM = MassSpringDamper()
+SYSTEM = synthetic.MassSpringDamper()
 THETA = SYSTEM.paper_theta()
 SAMPLES, NOISE, AMPLITUDE = 10_000, 0.00018, 100.0
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
@@ -33,7 +27,7 @@ FRICTION = Suspect(
         "vs": SYSTEM.stribeck,
     },
 )
-MACHINE = mass_spring_damper().baseline
+MACHINE = synthetic.mass_spring_damper().baseline
 FIRST = Baseline.from_terms([Term("a", "y[k-1]", initial=0.9), Term("b", "u[k-1]", initial=0.1)])
 
 
@@ -109,30 +103,18 @@ def test_predicted_and_measured_errors_of_usual_inputs(
     assert np.median(errors(wave)) == pytest.approx(known, rel=0.08)
 
 
-def test_the_prediction_is_what_the_bias_table_and_least_squares_say(designed: Design) -> None:
-    """Φ⁺Δ of `bias_table` and σ²(ΦᵀΦ)⁻¹ on an independent simulation of the same input."""
-    record = Record.from_arrays(
-        designed.signal,
-        SYSTEM.simulate(designed.signal, THETA),
-        inputs=["force"],
-        outputs=["position"],
-        sampling_time=0.01,
-    )
-    posed = pose(record, MACHINE)
-    deltas = suspect_columns([FRICTION], posed.rows.x, posed.layout, posed.outputs)
-    (entry,) = bias_table(
-        posed.projection,
-        posed.baseline.names,
-        [FRICTION],
-        deltas,
-        gain=posed.weight.matrix,
-        theta=THETA,
-        certify=False,
-    )
-    assert designed.bias == pytest.approx(entry.expected, rel=1e-9)
-    factor = posed.projection.covariance_factor() / posed.deviation[0]
-    assert designed.std == pytest.approx(NOISE * np.sqrt(np.sum(factor**2, axis=1)), rel=1e-9)
-    assert designed.condition == pytest.approx(posed.excitation.condition, rel=1e-9)
+def test_the_prediction_is_what_least_squares_says(designed: Design) -> None:
+    """Φ⁺Δ and σ²(ΦᵀΦ)⁻¹ on an independent simulation of the same input."""
+    u, y = designed.signal, SYSTEM.simulate(designed.signal, THETA)
+    x = np.stack([y[1:-1], y[:-2], u[1:-1]], axis=1)
+    layout = Suspect("all", "position[k-1] + position[k-2] + force[k-1]").lags
+    delta = FRICTION.coefficient * FRICTION.values(x, layout, ["position"])[:, 0]
+    size = np.linalg.norm(x, axis=0)
+    bias = np.linalg.lstsq(x / size, delta, rcond=None)[0] / size
+    assert designed.bias == pytest.approx(bias, rel=1e-9)
+    unit = np.sqrt(np.diag(np.linalg.inv((x / size).T @ (x / size)))) / size
+    assert designed.std == pytest.approx(NOISE * unit, rel=1e-9)
+    assert designed.condition == pytest.approx(np.linalg.cond(x / size), rel=1e-9)
     assert designed.cost == pytest.approx(
         np.sum((designed.bias**2 + designed.std**2) / THETA**2), rel=1e-12
     )
@@ -217,7 +199,7 @@ def test_weights_say_what_counts() -> None:
 
 
 def test_two_outputs_with_other_noise_shared_parameters_and_a_known_input() -> None:
-    """Against a Monte-Carlo regression that whitens the outputs as `pose` does."""
+    """Against a Monte-Carlo regression of outputs divided by their standard deviations."""
     baseline = Baseline.from_terms(
         [
             Term("a", "y[k-1]", initial=0.5, output="y"),
@@ -252,9 +234,11 @@ def test_two_outputs_with_other_noise_shared_parameters_and_a_known_input() -> N
         for k in range(2, 300):
             y[k] = 0.5 * y[k - 1] + u[k - 1] + w[k - 1] - 0.05 * y[k - 1] * abs(y[k - 1]) + e[k, 0]
             z[k] = 10 * u[k - 2] + 2 * y[k - 1] + e[k, 1]
-        record = Record.from_arrays(np.stack([u, w], 1), np.stack([y, z], 1), **names)
-        posed = pose(record, baseline)
-        thetas.append(posed.projection.solve(posed.whitened_target))
+        sizes = np.std(y), np.std(z)
+        phi = [[y[1:-1], u[1:-1] + w[1:-1]], [0 * y[1:-1], 10 * u[:-2]]]
+        columns = np.concatenate([np.stack(p, 1) / s for p, s in zip(phi, sizes, strict=True)])
+        target = np.concatenate([y[2:] / sizes[0], (z[2:] - 2 * y[1:-1]) / sizes[1]])
+        thetas.append(np.linalg.lstsq(columns, target, rcond=None)[0])
     assert np.mean(thetas, axis=0) - [0.5, 1.0] == pytest.approx(found.bias, abs=3e-3)
     assert np.std(thetas, axis=0) == pytest.approx(found.std, rel=0.15)
 

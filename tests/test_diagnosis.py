@@ -10,21 +10,26 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from orthaug.analysis.diagnosis import diagnose
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    Channel,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Prediction,
+    Record,
+    Simulation,
+    Term,
+    diagnose,
+    estimate,
+    synthetic,
+)
 from orthaug.analysis.inconsistency import inconsistency
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.verdict_text import _shares
-from orthaug.data.record import Channel, Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.criteria import Prediction, Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive
-from orthaug.models.learners import MLP
-from orthaug.models.model import Model
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import DiagnosisResult
-from orthaug.studies import synthetic
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 EVIDENCE = {

@@ -15,11 +15,9 @@ from pathlib import Path
 import pytest
 from sources import parsed
 from test_architecture import ROOMS
-from test_cli import make_project
+from test_cli import make_project, run
 
 import orthaug
-from orthaug.commands.cli import app
-from orthaug.commands.spec import load_spec
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound
 
@@ -101,9 +99,7 @@ def commands_in(text: str) -> set[str]:
     }
 
 
-COMMANDS = {
-    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
-}
+COMMANDS = {*re.findall(r"^  (\w+) ", run("--help").out.partition("Commands:")[2], re.MULTILINE)}
 
 
 @cache
@@ -214,8 +210,8 @@ def test_the_learner_of_the_example_is_one_file_and_one_entry(tmp_path):
     spec.write_text(
         re.sub(r"^\[learner\]\n(?:\w.*\n)*", section, spec.read_text(), flags=re.MULTILINE)
     )
-    with LEARNERS.added("polynomial", polynomial):
-        assert load_spec(spec).declared_learner() == polynomial(highest=2)
+    with LEARNERS.with_kind("polynomial", polynomial):
+        assert orthaug.load_spec(spec).spec.declared_learner() == polynomial(highest=2)
     assert Bound(polynomial(), nz=2, ny=1).size == 4
     with pytest.raises(
         orthaug.InputError, match="`highest` must be a whole number, 2 or more; got 1"
@@ -272,3 +268,19 @@ def test_the_most_used_names_have_examples():
         for name in wanted.split()
         if ">>> " not in (inspect.getdoc(getattr(orthaug, name)) or "")
     } == set()
+
+
+def test_the_glossary_is_short_sorted_and_plain() -> None:
+    """At most 25 words of our own, in order, each explained in at most two sentences and in use elsewhere."""
+    page = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", page, re.M)[1:]
+    terms = [term for term, _ in rows]
+    others = " ".join(
+        file.read_text(encoding="utf-8")
+        for file in (ROOT / "docs").rglob("*.md")
+        if file.name != "glossary.md"
+    )
+    assert 15 <= len(terms) <= 25 and terms == sorted(set(terms))
+    used = others.replace("_", " ")
+    assert [one for one in terms if not re.search(one.split(", ")[0], used, re.I)] == []
+    assert [term for term, text in rows if not text.endswith(".") or text.count(". ") > 1] == []

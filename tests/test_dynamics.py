@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug import MLP, Baseline, Lags, Record, Term
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers, Parts
 from orthaug.models.lagged import Lagged
-from orthaug.models.learners import MLP, Bound
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.models.learners import Bound
 from orthaug.physics.problem import pose
 
 # --- the lagged form

@@ -17,12 +17,10 @@ import pandas as pd
 import pytest
 
 import orthaug as oa
-from orthaug.commands.fit import fit_job
-from orthaug.commands.kinds import open_job
+from orthaug import Stream
 from orthaug.commands.select import open_select, select_for
 from orthaug.commands.spec import load_spec
 from orthaug.data.sources import witness
-from orthaug.models.streaming import Stream
 
 pytest.importorskip("pyarrow")
 ROWS, GROUP = 1200, 170
@@ -92,8 +90,8 @@ def fitted(folder, kind, structure="orthogonal", regularization='"none"', more="
     path = folder / f"{kind}.toml"
     text = SPEC.format(kind=kind, structure=structure, regularization=regularization)
     path.write_text(text + more + "\n", encoding="utf-8")
-    job = open_job(path)
-    found = json.loads(fit_job(job).result.to_json())
+    job = oa.load_spec(path)
+    found = json.loads(oa.fit_spec(job).result.to_json())
     if kind == "dask":
         job.engine.client.close()
     return found
@@ -165,9 +163,9 @@ def test_the_residual_of_all_rows_is_tested_where_a_witness_stands_for_them(fold
 @pytest.fixture(scope="module")
 def cluster():
     pytest.importorskip("distributed")
-    from orthaug.models.cluster import connected
+    from orthaug.models.cluster import connect
 
-    client = connected(None, 2)
+    client = connect(None, 2)
     yield client
     client.close()
     client.cluster.close()
@@ -311,7 +309,7 @@ def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch
 
 
 def test_segments_on_workers_give_the_free_run_of_rows_in_memory(folder, in_memory, cluster):
-    from orthaug.models.cluster import Dask
+    from orthaug import Dask
 
     check_flown(told_of(flown_lagged(opened(folder), Dask(cluster))), in_memory["lagged"])
     check_flown(told_of(flown_motion(from_files(folder), Dask(cluster))), in_memory["motion"])
@@ -389,12 +387,12 @@ DEVICES = """
 import sys
 sys.path.insert(0, {tests!r})
 import pathlib, json, test_engines as t
-from orthaug.models.devices import Devices
+import orthaug as oa
 folder = pathlib.Path({folder!r})
 (folder / "devices.json").write_text(json.dumps(t.fitted(folder, "devices", more="devices = 3")))
 for kind, fly in (("lagged", t.flown_lagged), ("motion", t.flown_motion)):
-    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(fly(t.from_files(folder), Devices()))))
-from orthaug._base.jax import jax
+    (folder / f"{{kind}}.json").write_text(json.dumps(t.told_of(fly(t.from_files(folder), oa.Devices()))))
+import jax
 assert len(jax.devices()) == 4
 """
 
@@ -439,7 +437,7 @@ def test_runs_on_a_cluster_have_the_bits_of_runs_here(folder, cluster, held_here
     """Two regularizations, the blocks that choose between them, and those of the verdict: whole runs are tasks."""
 
     def fitted_to(path):
-        return json.loads(fit_job(open_job(path)).result.to_json())
+        return json.loads(oa.fit_spec(path).result.to_json())
 
     expected, found = tables(folder, cluster, held_here, fitted_to)
     for result in (expected, found):
@@ -483,7 +481,7 @@ def bad(folder, match, frame=None, name="c.parquet", **changes):
     path.write_text(text, encoding="utf-8")
     try:
         with pytest.raises(oa.InputError, match=match):
-            open_job(path)
+            oa.load_spec(path)
     finally:
         extra.unlink(missing_ok=True)
 
@@ -545,7 +543,7 @@ def test_a_file_that_changes_is_noticed(folder):
         SPEC.format(kind="stream", structure="orthogonal", regularization='"none"'),
         encoding="utf-8",
     )
-    job = open_job(path)
+    job = oa.load_spec(path)
     file = folder / "runs" / "b.parquet"
     content = file.read_bytes()
     try:
@@ -569,7 +567,7 @@ def test_gaps_end_a_stretch_in_files_too(folder, tmp_path):
         text = SPEC.format(kind=kind, structure="orthogonal", regularization='"none"')
         text = text.replace("[data]", '[data]\nmissing = "skip"')
         (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
-        problem = open_job(tmp_path / "spec.toml").problem
+        problem = oa.load_spec(tmp_path / "spec.toml").problem
         thetas.append((problem.count, problem.least_squares))
     assert thetas[0][0] == thetas[1][0]
     np.testing.assert_allclose(thetas[1][1], thetas[0][1], rtol=1e-12)

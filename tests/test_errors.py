@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthaug import Channel, InputError, TrainingError, read_record
 from orthaug._base.checks import check_choice, check_count, check_label, check_number, check_type
-from orthaug._base.errors import LONGEST, InputError, KeyedError, TrainingError, shown
-from orthaug.data.readers import read_record
-from orthaug.data.record import Channel
+from orthaug._base.errors import LONGEST, KeyedError, show
 
 ROUGH = "a\nb\r\x1b[31mred\x07\x00\u202e\ud800end"
 
@@ -78,7 +77,7 @@ VALUES = {
 
 @pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())
 def test_values_are_shown_on_one_line(value):
-    assert len(shown(value)) <= LONGEST and shown(value).isprintable()
+    assert len(show(value)) <= LONGEST and show(value).isprintable()
     for check in (
         lambda: check_number(value, "x"),
         lambda: check_count(value if not isinstance(value, int) else -value, "x"),

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import re
 
+import jax
+import jax.numpy as jnp
 import naive
 import numpy as np
 import pytest
 from helpers import unfolded
 
 import orthaug as oa
-from orthaug._base.errors import InputError, RankError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    Channel,
+    Function,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    Parameter,
+    RankError,
+    Record,
+    Term,
+    estimate,
+    orthogonalize,
+)
 from orthaug._base.progress import StopTraining
-from orthaug.data.record import Channel, Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.models.learners import MLP, Function
-from orthaug.physics.baseline import Baseline, Parameter, Term
 
 LINEAR = MLP(hidden=())
 NETWORK = MLP(hidden=(4,))

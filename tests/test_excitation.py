@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError, RankError
-from orthaug.data.expressions import Lag
-from orthaug.data.record import Record
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.excitation import excitation, identifiability, require_rank
+from orthaug import Baseline, InputError, RankError, Record, Term, identifiability
+from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.problem import pose
 from orthaug.physics.projection import Projection
 
@@ -91,7 +88,7 @@ def test_more_columns_than_rows():
         require_rank(found, 2)
 
 
-LAYOUT = (Lag("y", 1), Lag("u", 0))
+LAYOUT = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "u[k]")]).lags
 
 
 def test_identifiable_but_not_excited():

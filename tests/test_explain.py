@@ -10,13 +10,15 @@ import pytest
 from test_cli import one_line, run, write_csv
 
 import orthaug as oa
-from orthaug._base.errors import InputError
-from orthaug.commands.spec import load_spec
+from orthaug import InputError, Output, State
 from orthaug.data.expressions import parse_named
-from orthaug.physics.motion import Output, State
-from orthaug.selection.explaining import _written, candidates_of
+from orthaug.selection.explaining import _expression_text, candidates_of
 from orthaug.selection.explanation import NewTerm, added_to_motion
-from orthaug.selection.learned_linearization import MotionResponse, _moved, linearization_of
+from orthaug.selection.learned_linearization import (
+    MotionResponse,
+    _move_parameters,
+    linearization_of,
+)
 
 ROWS = 600
 SPEC = """
@@ -257,9 +259,9 @@ def test_a_step_of_parameters_ends_at_their_bounds_but_at_no_zero_that_is_divide
         [State("v", "(u - c*v)/m")], [Output("y", "v")], parameters, ["u"]
     )
     x, u, q = np.ones((3, 1)), np.ones((3, 1)), motion.coordinates.of([0.5, 2.0])
-    assert _moved(motion, q, np.array([-0.4, 0.1]), x, u) == pytest.approx([0.3, 2.2])
-    assert _moved(motion, q, np.array([-1.1, 0.6]), x, u) == pytest.approx([0.0, 3.0])
-    assert _moved(motion, q, np.array([0.0, -1.1]), x, u) == pytest.approx(
+    assert _move_parameters(motion, q, np.array([-0.4, 0.1]), x, u) == pytest.approx([0.3, 2.2])
+    assert _move_parameters(motion, q, np.array([-1.1, 0.6]), x, u) == pytest.approx([0.0, 3.0])
+    assert _move_parameters(motion, q, np.array([0.0, -1.1]), x, u) == pytest.approx(
         [0.5, 2.0 * np.exp(-1.1)]
     )
 
@@ -282,7 +284,12 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
     assert done.code == 0 and told["found"] and told["terms"][0]["expression"] == "y[k-1]**3"
     grown = project / "grown.toml"
     grown.write_text(SPEC + told["spec"] + "\n" + ALONE, encoding="utf-8")
-    assert [term.parameter for term in load_spec(grown).baseline.terms] == ["a", "b", "g", "cubic"]
+    assert [term.parameter for term in oa.load_spec(grown).spec.baseline.terms] == [
+        "a",
+        "b",
+        "g",
+        "cubic",
+    ]
     page = run("explain", project / "plant", project / "run.csv").out
     assert (
         page.startswith("y[k-1]**3 explains 9")
@@ -321,7 +328,7 @@ def test_where_the_spec_has_a_map_to_physical_parameters_the_lines_for_it_are_to
     (project / "mapped.toml").write_text(
         SPEC + term + "\n" + own + 'cubic = "cubic"\n' + ALONE, encoding="utf-8"
     )
-    assert load_spec(project / "mapped.toml").baseline.terms[3].parameter == "cubic"
+    assert oa.load_spec(project / "mapped.toml").spec.baseline.terms[3].parameter == "cubic"
 
 
 @pytest.mark.parametrize(
@@ -402,7 +409,7 @@ def test_wrong_use_is_told_in_a_line(project):
     [("v", "v**3"), ("y[k-2]", "y[k-2]**3"), ("(y[k-1] - y[k-2])/Ts", "((y[k-1] - y[k-2])/Ts)**3")],
 )
 def test_a_cube_of_what_is_no_name_has_brackets(on, expected):
-    assert _written("cubic", on) == expected
+    assert _expression_text("cubic", on) == expected
 
 
 def test_no_difference_of_two_peaks_is_proposed():

@@ -15,12 +15,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_cli import run
 
 import orthaug as oa
-from orthaug._base.jax import jax, jnp
-from orthaug.commands.cli import main
+from orthaug import Baseline, Model, MotionModel, Terms, numpy_step
 from orthaug.data.expressions import FUNCTIONS, parse, parse_named
 from orthaug.data.regressors import Features
 from orthaug.export import fmu, nodes
@@ -28,16 +30,12 @@ from orthaug.export.kinds import TARGETS
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import Number, apply
 from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
-from orthaug.export.numpy_step import NumpyStep, numpy_step
+from orthaug.export.numpy_step import NumpyStep
 from orthaug.models.beyond import pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import ACTIVATIONS, Bound
-from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import MotionDynamics
-from orthaug.models.terms import Terms
-from orthaug.physics.baseline import Baseline
 
 POINTS, STEPS = 1000, 10_000
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")
@@ -764,13 +762,6 @@ def saved(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def command(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["orthaug", "export", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -793,17 +784,17 @@ def command(monkeypatch, *arguments: str) -> int:
         (("out", "--out", "new"), "Missing option '--to'"),
     ],
 )
-def test_bad_input_of_the_command_writes_nothing(saved, monkeypatch, capsys, arguments, words):
+def test_bad_input_of_the_command_writes_nothing(saved, arguments, words):
     before = sorted(path.name for path in saved.rglob("*"))
-    assert command(monkeypatch, *arguments) == 2
-    assert words in capsys.readouterr().err
+    done = run("export", *arguments)
+    assert done.code == 2 and words in done.err
     assert sorted(path.name for path in saved.rglob("*")) == before
 
 
-def test_the_command_writes_a_folder_and_replaces_its_own(saved, monkeypatch, capsys):
+def test_the_command_writes_a_folder_and_replaces_its_own(saved):
     for _ in range(2):
-        assert command(monkeypatch, "out", "--to", "numpy", "--out", "new", "--name", "plant") == 0
-        assert capsys.readouterr().out == "written to new\n"
+        done = run("export", "out", "--to", "numpy", "--out", "new", "--name", "plant")
+        assert (done.code or 0, done.out) == (0, "written to new\n")
     assert {path.name for path in (saved / "new").iterdir()} >= {
         "plant.py",
         "README.md",
@@ -813,5 +804,5 @@ def test_the_command_writes_a_folder_and_replaces_its_own(saved, monkeypatch, ca
         (saved / "out" / "model" / "model.json").read_text().replace('"format": 2', '"format": 99')
     )
     (saved / "out" / "model" / "model.json").write_text(newer)
-    assert command(monkeypatch, "out", "--to", "c", "--out", "other") == 2
-    assert "in format 99" in capsys.readouterr().err and not (saved / "other").exists()
+    done = run("export", "out", "--to", "c", "--out", "other")
+    assert done.code == 2 and "in format 99" in done.err and not (saved / "other").exists()

@@ -6,13 +6,14 @@ import math
 import sys
 import warnings
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import InputError
 from orthaug.data.expressions import FUNCTIONS, Lag, parse
 
 Y1, Y2, U0, U3 = Lag("y", 1), Lag("y", 2), Lag("u", 0), Lag("u", 3)

@@ -91,13 +91,13 @@ def test_what_the_tests_name_is_drawn_and_not_what_explains_more():
     found = analysed(e, x)
     assert found.curved_regressors == ["voltage[k-1]"]
     assert found.regressors["current[k-1]"].share > found.regressors["voltage[k-1]"].share
-    assert list(found.most_telling) == ["voltage[k-1]"]
+    assert list(found.strongest) == ["voltage[k-1]"]
     (plot,) = (p for p in residual_plots(found, "one-step residual", UNITS) if "Mean of" in p.label)
     assert "p < 10⁻⁶" in plot.caption
     means, arms = np.array(plot.traces[0]["y"]), np.array(plot.traces[0]["error_y"]["array"])
     assert np.sum(np.abs(means) > arms) > 3, "what is rejected is seen to be"
     flat = found.model_copy(update={"curved_regressors": []})
-    assert list(flat.most_telling) == ["current[k-1]"]
+    assert list(flat.strongest) == ["current[k-1]"]
 
 
 def test_errors_over_a_regressor_hold_what_they_say_for_a_coloured_residual():
@@ -121,7 +121,7 @@ def test_a_residual_figure_has_its_units_and_keeps_within_its_edges(tmp_path):
         crossed.get_ylabel() == "correlation with the inputs"
         and over.get_ylabel() == "mean residual [rad/s]"
     )
-    (name,) = found.most_telling
+    (name,) = found.strongest
     assert over.get_xlabel() == f"{name} [{UNITS[name.partition('[')[0]]}]"
     assert drawn(figure, tmp_path / "figure.png")
     edge = figure.bbox

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from orthaug.data.record import Record
+from orthaug import Record
 from orthaug.selection.first_orders import first_model
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from orthaug import InputError
 from orthaug._base import folders as partials
-from orthaug._base.errors import InputError
 from orthaug._base.folders import check_new_file, check_replaceable, whole_file, whole_folder
 
 

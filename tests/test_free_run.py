@@ -4,25 +4,33 @@ from __future__ import annotations
 
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 import scipy.signal
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    InputError,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Prediction,
+    Record,
+    Simulation,
+    Term,
+)
+from orthaug import estimate as choosing
 from orthaug._base.progress import StopTraining
-from orthaug.data.record import Record
-from orthaug.fitting.criteria import Prediction, Simulation
-from orthaug.fitting.estimation import estimate as choosing
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segmented_lagged import SegmentedLagged
 from orthaug.fitting.segments import respond
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
 LM, FREE, NETWORK = LevenbergMarquardt(150), Simulation(64, 8, 10), MLP(hidden=(3,))

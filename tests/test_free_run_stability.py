@@ -5,30 +5,34 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    Baseline,
+    Function,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Record,
+    Term,
+    estimate,
+    load,
+    orthogonalize,
+    save,
+    stability,
+)
 from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
 from orthaug.analysis import lipschitz as gradients
-from orthaug.analysis.boundedness import divergence_scaling
-from orthaug.analysis.contraction import contraction
 from orthaug.analysis.feedback import feedback
-from orthaug.analysis.free_run_stability import stability
-from orthaug.analysis.lipschitz import lipschitz
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags, stack_rows
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.data.regressors import stack_rows
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Parts
-from orthaug.models.learners import MLP, Function
-from orthaug.models.model import Model
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import StabilityResult
 
 FEW = LevenbergMarquardt(iterations=5)
@@ -180,7 +184,8 @@ def test_poles_of_linear_models(poles):
     """No norm has a rate below the radius; the one that is found comes close and forgets the start as it says."""
     model = linear(poles)
     record = driven(model, noise(400))
-    found, contracts = feedback(model, record), contraction(model, record)
+    whole = stability(model, record)
+    found, contracts = whole.feedback, whole.contraction
     radius = max(np.abs(poles))
     assert found.largest == pytest.approx(radius, abs=1e-6) and found.median == pytest.approx(
         radius, abs=1e-6
@@ -201,7 +206,7 @@ def test_a_normal_matrix_needs_no_other_norm():
         BOTH, [0.9 * np.cos(1), -0.9 * np.sin(1), 0.9 * np.sin(1), 0.9 * np.cos(1), 1.0], ("p", "q")
     )
     record = driven(model, noise(300))
-    contracts = contraction(model, record)
+    contracts = stability(model, record).contraction
     assert contracts.bound == pytest.approx(0.9) and 0.9 - 1e-9 <= contracts.rate < 0.905
 
 
@@ -229,7 +234,8 @@ def test_scalar_nonlinear():
     model = model_of([Term("a", "tanh(y[k-1])"), Term("b", "u[k-1]")], [0.9, 1.0])
     record = driven(model, noise(500))
     y = record.experiments[0].outputs[:-1, 0]
-    found, contracts = feedback(model, record), contraction(model, record, box=100)
+    whole = stability(model, record, box=100)
+    found, contracts = whole.feedback, whole.contraction
     np.testing.assert_allclose(found.radius, 0.9 / np.cosh(y) ** 2, rtol=1e-9, atol=1e-12)
     assert found.worst.row == np.argmin(np.abs(y)) + 1
     assert found.worst.regressor["y[k-1]"] == y[found.worst.row - 1]
@@ -298,7 +304,7 @@ def test_slope_of_the_search():
 
 def test_duffing_diverges_at_a_known_factor(duffing):
     model, record = duffing
-    factor = divergence_scaling(model, record)
+    factor = stability(model, record).diverges_at
     (e,) = record.experiments
     mean = e.inputs.mean()
 
@@ -308,7 +314,7 @@ def test_duffing_diverges_at_a_known_factor(duffing):
 
     assert diverges(factor) and not diverges(factor / 1.05)
     assert 1.5 < factor < 10
-    assert divergence_scaling(model, record, largest=1.2) is None
+    assert stability(model, record, largest=1.2).diverges_at is None
 
 
 def test_a_threshold_that_is_known():
@@ -318,7 +324,7 @@ def test_a_threshold_that_is_known():
         [0.5, 10.0, 1.0],
     )
     u = 3 + np.tile(np.repeat([1.0, -1.0], 50), 4)
-    assert 2 < divergence_scaling(model, driven(model, u)) <= 2.1
+    assert 2 < stability(model, driven(model, u)).diverges_at <= 2.1
 
 
 def test_a_model_without_inputs_has_none_to_scale():
@@ -335,7 +341,7 @@ def test_a_model_without_inputs_has_none_to_scale():
 
 def test_small_margin_warns(duffing):
     model, record = duffing
-    factor = divergence_scaling(model, record)
+    factor = stability(model, record).diverges_at
     (e,) = record.experiments
     hot = Record.from_arrays((e.inputs - e.inputs.mean()) * factor / 1.3, e.outputs)
     found = stability(model, hot)
@@ -372,7 +378,6 @@ def test_without_feedback():
     record = Record.from_arrays(noise(50), noise(50, 2))
     found = stability(model, record)
     assert found.feedback is None and found.contraction is None and found.diverges_at is None
-    assert feedback(model, record) is None and contraction(model, record) is None
     assert (
         "uses no past outputs: its free run cannot diverge" in found.text and found.warnings == ()
     )
@@ -389,7 +394,7 @@ def test_two_experiments(duffing):
     assert found.steps == 98 + 2998
     np.testing.assert_array_equal(found.transition[98:], alone.transition)
     np.testing.assert_array_equal(found.points.where.experiment, np.repeat([0, 1], [98, 2998]))
-    worst = contraction(model, both).worst
+    worst = stability(model, both).contraction.worst
     assert worst.experiment == 1 and worst.where == f"experiment 1, row {worst.row}"
     wild = Record.join([record, Record.from_arrays(20 * e.inputs, e.outputs)])
     assert feedback(model, wild).diverged[0].startswith("y at experiment 1, row ")
@@ -397,7 +402,7 @@ def test_two_experiments(duffing):
 
 def test_samples_are_bounded_and_the_same(duffing, monkeypatch):
     model, record = duffing
-    first, again = (contraction(model, record, box=50) for _ in range(2))
+    first, again = (stability(model, record, box=50).contraction for _ in range(2))
     assert first.rate == again.rate and (first.metric == again.metric).all()
     assert 2000 <= first.samples <= 2050
     monkeypatch.setattr(radii, "MOST_STEPS", 500)
@@ -433,7 +438,7 @@ def test_lipschitz_of_known_gradients():
     """g = a y₁ y₂ + b u: ∂g/∂x = (a y₂, a y₁, b); ∂φ/∂x = [[y₂, y₁, 0], [0, 0, 1]]."""
     model = model_of([Term("a", "y[k-1]*y[k-2]"), Term("b", "u[k-1]")], [0.5, 3.0])
     u, y = noise(200), 5 * noise(200, 2)
-    found = lipschitz(model, Record.from_arrays(u, y))
+    found = stability(model, Record.from_arrays(u, y)).lipschitz
     y1, y2, u1 = y[1:-1], y[:-2], u[1:-1]
     size = np.sqrt(0.25 * (y1**2 + y2**2) + 9)
     assert found.gradient == pytest.approx(size.max()) and found.rows == 198
@@ -472,7 +477,7 @@ def test_lipschitz_of_the_weights_of_a_known_learner(monkeypatch):
         z[:, 0] ** 2,
     ]  # Σ over the weights, for each entry of x
     squares = np.stack(columns, axis=1) * (numbers.gain / numbers.halfwidth) ** 2
-    found = lipschitz(model, record)
+    found = stability(model, record).lipschitz
     assert (
         found.weights == pytest.approx(np.sqrt(squares.sum(axis=1)).max())
         and found.weights_rows == 199
@@ -483,7 +488,7 @@ def test_lipschitz_of_the_weights_of_a_known_learner(monkeypatch):
         and found.weights_worst.row == scaled.argmax() + 1
     )
     monkeypatch.setattr(gradients, "_MOST_CELLS", 4 * 50)
-    few, some = lipschitz(model, record), np.linspace(0, 198, 50).round().astype(int)
+    few, some = stability(model, record).lipschitz, np.linspace(0, 198, 50).round().astype(int)
     assert few.weights_rows == 50 and few.weights == pytest.approx(
         np.sqrt(squares[some].sum(axis=1)).max()
     )
@@ -499,7 +504,7 @@ def test_lipschitz_of_the_weights_of_a_network(network):
         slope = jax.jacfwd(lambda w, x: form.at(numbers._replace(weights=w), x).total)
         return jnp.linalg.norm(jax.jacfwd(slope, 1)(numbers.weights, row).ravel())
 
-    assert lipschitz(model, record).weights == pytest.approx(
+    assert stability(model, record).lipschitz.weights == pytest.approx(
         float(jax.jit(jax.vmap(size))(x).max())
     )
 
@@ -511,7 +516,7 @@ def test_lipschitz_of_no_weights(duffing):
         record, Baseline.from_terms([DUFFING[0]]), lambda x: x[:, 0], lags=Lags(na=2, nb=1)
     ).model
     for one in (model, split):
-        found = lipschitz(one, record.rows(None, 300))
+        found = stability(one, record.rows(None, 300)).lipschitz
         assert (found.weights, found.weights_scaled, found.weights_worst, found.weights_rows) == (
             None,
             None,
@@ -613,7 +618,7 @@ def test_the_search_tries_the_factors_of_a_plain_one(duffing, scale):
     while high > 1.05 * low:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if diverges(middle) else (middle, high)
-    assert divergence_scaling(model, record) == high
+    assert stability(model, record).diverges_at == high
 
 
 def test_channels_by_name(network):
@@ -675,7 +680,8 @@ def test_a_state_that_is_no_past_output():
     u = 0.1 * noise(400)
     record = Record.from_arrays(u, noise(400, 2))
     assert isinstance(model.form, Dynamics)
-    found, contracts = feedback(model, record), contraction(model, record, box=50)
+    whole = stability(model, record, box=50)
+    found, contracts = whole.feedback, whole.contraction
     x = visited_states(a, u)
     np.testing.assert_allclose(found.points.states, x, atol=1e-12)
     np.testing.assert_array_equal(found.points.inputs, u[:, None])
@@ -698,7 +704,7 @@ def test_a_state_that_is_no_past_output_grows_as_its_inputs():
     """y is of third degree in the inputs: it reaches 10⁶ times the largest at a factor known from a plain loop."""
     model, a = oscillating(0.9)
     u = 0.1 * noise(400)
-    factor = divergence_scaling(model, Record.from_arrays(u, noise(400, 2)))
+    factor = stability(model, Record.from_arrays(u, noise(400, 2))).diverges_at
 
     def peak(s):
         x = visited_states(a, u.mean() + s * (u - u.mean()))
@@ -761,5 +767,3 @@ def test_records_refused(duffing):
         match=r"`x` has shape \(2998, 2\); the usable regressors of the record have \(2998, 3",
     ):
         stability(model, record, x=stack_rows(record, model.form.layout).x[:, :2])
-    with pytest.raises(InputError, match="no measured outputs to start from"):
-        divergence_scaling(model, Record.from_arrays(noise(50)))

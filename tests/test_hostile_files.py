@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthaug import InputError, read_record
 from orthaug._base import memory
-from orthaug._base.errors import InputError
-from orthaug.data.readers import read_record
 from orthaug.data.survey import survey
 from orthaug.data.tables import read_table
 

@@ -66,7 +66,7 @@ def told(tmp_path, command, text, apart, **options):
 )
 def test_inputs_that_are_nearly_one(tmp_path, command, text, apart):
     (warning,) = told(tmp_path, command, text, apart)
-    assert "the data hardly tell b, c apart" in warning and "Fix one of them" in warning
+    assert "the data hardly distinguish b, c." in warning and "Fix one of them" in warning
     condition = float(warning.partition("(condition ")[2].partition(" ")[0])
     part = float(warning.partition("to 1 part in ")[2].partition(";")[0])
     assert 0.5 < part * apart < 2 and 1 < condition * apart < 4  # √2 each, and a third column
@@ -107,7 +107,7 @@ def test_a_column_that_is_nearly_a_sum_of_two():
     u[:, 2] = u[:, 0] + u[:, 1] + 1e-6 * rng.normal(size=500)
     y = u[:, 0] + 0.1 * rng.normal(size=500)
     (warning,) = fitted(u, y, ["u1[k]", "u2[k]", "u3[k]", "1"])
-    assert "hardly tell t0, t1, t2 apart" in warning
+    assert "hardly distinguish t0, t1, t2." in warning
 
 
 def test_two_pairs_are_two_findings():
@@ -116,7 +116,7 @@ def test_two_pairs_are_two_findings():
     u[:, 1::2] += 1e-6 * rng.normal(size=(500, 2))
     y = u[:, 0] + u[:, 2] + 0.1 * rng.normal(size=500)
     first, second = fitted(u, y, ["u1[k]", "u2[k]", "u3[k]", "u4[k]"])
-    assert "hardly tell t0, t1 apart" in first and "hardly tell t2, t3 apart" in second
+    assert "hardly distinguish t0, t1." in first and "hardly distinguish t2, t3." in second
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.3])

@@ -15,7 +15,8 @@ import scipy.signal
 from helpers import unfolded
 from test_cli import run
 
-from orthaug.commands import cli, kinds
+from orthaug import load_spec
+from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
 from orthaug.data.survey import channel_name, split_header, survey
@@ -211,7 +212,7 @@ def test_one_wrong_sample_of_a_signal_that_moves_fast_is_seen_and_replaced(tmp_p
     assert (
         done.code == 0 and "; 1 sample far from all neighbours, which the spec replaces" in done.out
     )
-    job = kinds.open_job(tmp_path / "spec.toml")
+    job = load_spec(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].samples == 1
 
 
@@ -398,9 +399,7 @@ def test_dates_are_the_clock(tmp_path):
         done = run("init", tmp_path / f"a.{ending}", "--out", tmp_path / "spec.toml", "--force")
         assert "sampling time: 0.02 s, from column 'logged'" in done.out, done.err
         assert "left out" not in done.out
-        assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
-            0.02
-        )
+        assert load_spec(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
 
 
 def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
@@ -416,15 +415,13 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
     assert run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml").code == 0
     assert "sampling_time" in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert not [
-        w
-        for w in kinds.open_job(tmp_path / "spec.toml").warnings
-        if w.code == "other_sampling_time"
+        w for w in load_spec(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"
     ]
     t[200:] += 20.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
     assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in done.out, done.err
-    job = kinds.open_job(tmp_path / "spec.toml")
+    job = load_spec(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].step == "resample"
     assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
 
@@ -457,9 +454,7 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
     (tmp_path / "spec.toml").write_text(spec)
     warnings = [
-        w
-        for w in kinds.open_job(tmp_path / "spec.toml").warnings
-        if w.code == "other_sampling_time"
+        w for w in load_spec(tmp_path / "spec.toml").warnings if w.code == "other_sampling_time"
     ]
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
@@ -507,9 +502,7 @@ def test_a_sampling_time_that_is_thinned_already_is_refused(tmp_path, header, gi
         apart = (
             f"without a filter, so that rows are {every * given:g} s apart instead of {given:g} s"
         )
-        assert any(
-            apart in warning.text for warning in kinds.open_job(tmp_path / "spec.toml").warnings
-        )
+        assert any(apart in warning.text for warning in load_spec(tmp_path / "spec.toml").warnings)
 
 
 SINGLE = [
@@ -605,7 +598,7 @@ def test_the_time_is_known_by_rising_evenly_and_is_no_channel(tmp_path, header, 
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert (data["inputs"], data["outputs"]) == (["u"], ["y"])
     assert f"from column '{header or 'aika'}', which rises as time does" in done.out
-    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
+    assert load_spec(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
         step, rel=1e-3
     )
     done = run(
@@ -828,7 +821,7 @@ def test_measured_files_are_begun_with(data_folder, tmp_path, file, inputs, outp
     ]
     done = run("init", data_folder / file, *options)
     assert done.code == 0, done.err
-    assert kinds.open_job(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
+    assert load_spec(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(
         step, rel=1e-4
     )
 

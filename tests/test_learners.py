@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
-from orthaug.models.learners import ACTIVATIONS, MLP, Bound, EquinoxModule, External, Function
+from orthaug import MLP, EquinoxModule, External, Function, InputError
+from orthaug.models.learners import ACTIVATIONS, Bound
 
 KEY = jax.random.key(7)
 

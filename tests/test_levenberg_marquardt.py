@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from helpers import linear_columns, problem
 
+from orthaug import MLP, Function, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp, training_clock
 from orthaug.fitting.normal_equations import Normal, linearise
 from orthaug.fitting.solvers import compiled
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
-from orthaug.models.learners import MLP, Function
 from orthaug.models.rows import Overlap
 
 ROWS = 150
@@ -279,7 +278,7 @@ def test_pauses_change_nothing(monkeypatch, seconds):
     options = compiled.Options(
         jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES))
     )
-    start = compiled._begun(
+    start = compiled._first_state(
         w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1)
     )
     whole = compiled._advance(

@@ -12,7 +12,7 @@ from test_cli import make_project, run, signals, write_csv
 from test_compare import STARTED
 
 import orthaug as oa
-from orthaug._base.errors import InputError
+from orthaug import InputError
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

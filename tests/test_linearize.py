@@ -15,12 +15,11 @@ from test_cli import one_line, run
 from test_surface import WRONG, tried
 
 import orthaug as oa
-from orthaug._base.errors import InputError
-from orthaug.analysis.linear_system import System, converted, modes_of, observer_form
+from orthaug import InputError
+from orthaug.analysis.linear_system import System, convert_to_continuous, modes_of, observer_form
 from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag
 from orthaug.models.stepping import Memory
-from orthaug.reports.linear import LinearizeResult
 from orthaug.reports.linear_text import linear_text
 
 STEP = 0.05
@@ -299,12 +298,12 @@ def test_a_hold_is_undone_with_its_dead_time():
             matrix[i, n] = 1.0
     matrix[n, :n] = [row.get(name, 0.0) for name in memory.names]
     matrix[0] = matrix[n]
-    found = converted(System(matrix, n, STEP), "zoh", memory, memory.names)
+    found = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
     assert not isinstance(found, str) and list(found.dead_time) == pytest.approx([3 * STEP])
     s = 2j * np.pi * np.array([0.1, 1.0, 5.0])
     np.testing.assert_allclose(found.system.response(s).value[:, 0, 0], plant(s), rtol=1e-8)
     matrix[0, :2] = matrix[n, :2] = -0.3, 0.1
-    told = converted(System(matrix, n, STEP), "zoh", memory, memory.names)
+    told = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
     assert isinstance(told, str) and "a real pole below 0 (-0.5)" in told
 
 
@@ -418,7 +417,7 @@ def test_the_command_writes_numbers_a_page_and_figures(cubic, tmp_path, monkeypa
         and "written to linear" in done.out
     )
     told = json.loads((tmp_path / "linear/result.json").read_text())
-    assert LinearizeResult.model_validate(told).points[0].outputs["y"] == pytest.approx(0.5)
+    assert told["points"][0]["outputs"]["y"] == pytest.approx(0.5)
     assert told["held"] == "found" and len(told["points"][0]["frequency"]) == 400
     assert (tmp_path / "linear/linear.txt").read_text().strip() in done.out
     for name in ("bode", "poles"):

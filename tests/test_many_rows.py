@@ -11,12 +11,11 @@ import pytest
 from test_free_run import PHYSICS, nonlinear
 
 import orthaug as oa
+from orthaug import Orthogonal, Stream
 from orthaug._base.progress import StopTraining
 from orthaug.fitting import one_step
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.structures import Orthogonal
-from orthaug.fitting.training import planned
-from orthaug.models.streaming import Stream
+from orthaug.fitting.training import plan_runs
 from orthaug.physics.problem import pose
 
 ROWS, LM, NETWORK = 4000, oa.LevenbergMarquardt(100), oa.MLP(hidden=(3,))
@@ -51,12 +50,12 @@ def test_a_run_ends_as_low_as_from_its_own_start(many, monkeypatch):
 
 @pytest.mark.parametrize("regularization", ["none", "evidence", "ard"])
 def test_it_begins_at_the_weights_where_the_run_over_some_rows_ended(many, regularization):
-    task = OneStepTask.of(pose(given(), PHYSICS), NETWORK).prepared(LM, Orthogonal())
+    task = OneStepTask.of(pose(given(), PHYSICS), NETWORK).prepare(LM, Orthogonal())
     few = task.few
     assert len(few.problem.record) == 800 and few.few is None
     np.testing.assert_array_equal(few.scaling.halfwidth, task.scaling.halfwidth)
     np.testing.assert_array_equal(few.unit, task.unit)
-    (start,) = planned(task.bound, range(1), [regularization])
+    (start,) = plan_runs(task.bound, range(1), [regularization])
     first = few.run(LM, start.weights, Orthogonal(), regularization)
     expected = replace(task, few=None).run(LM, first.w, Orthogonal(), regularization)
     found = fitted(regularization=regularization)
@@ -86,7 +85,7 @@ def test_progress_counts_passes_over_all_rows_and_asks_for_an_end_in_both(many):
 
 
 def test_fewer_rows_are_run_over_as_they_are():
-    assert OneStepTask.of(pose(given(), PHYSICS), NETWORK).prepared(LM, Orthogonal()).few is None
+    assert OneStepTask.of(pose(given(), PHYSICS), NETWORK).prepare(LM, Orthogonal()).few is None
 
 
 def test_rows_that_lack_what_the_physics_needs_are_not_begun_with(many):
@@ -102,7 +101,7 @@ def test_rows_that_lack_what_the_physics_needs_are_not_begun_with(many):
             + 0.01 * rng.normal()
         )
     record = oa.Record.from_arrays(u, y)
-    assert OneStepTask.of(pose(record, PHYSICS), NETWORK).prepared(LM, Orthogonal()).few is None
+    assert OneStepTask.of(pose(record, PHYSICS), NETWORK).prepare(LM, Orthogonal()).few is None
     assert fitted(record).status.ok
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.data.matlab import read_mat5
 from orthaug.data.variables import read_variables
 

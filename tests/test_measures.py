@@ -6,18 +6,9 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags, largest_lag
-from orthaug.inference.measures import (
-    Measure,
-    Samples,
-    Support,
-    Symmetrized,
-    Training,
-    Uniform,
-    Weighted,
-)
+from orthaug import InputError, Lags, Record, Samples, Symmetrized, Training, Uniform, Weighted
+from orthaug.data.regressors import largest_lag
+from orthaug.inference.measures import Measure, Support
 
 RNG = np.random.default_rng(0)
 U = 0.3 * RNG.normal(size=400)

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
+from orthaug import InputError
 from orthaug._base import memory
-from orthaug._base.errors import InputError
 
 
 def test_there_is_some_memory_but_not_everything():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.models.response import scores
+from orthaug import scores
 from orthaug.reports.result import ScoreResult
 
 

@@ -11,12 +11,7 @@ import pytest
 from helpers import unfolded
 from test_cli import finite_json, one_line, run
 
-from orthaug._base.errors import InputError
-from orthaug.data.readers import read_record
-from orthaug.fitting.estimation import estimate
-from orthaug.models.storage import load
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.problem import pose
+from orthaug import Baseline, InputError, Term, estimate, load, read_record
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 GAPS = {
@@ -94,7 +89,7 @@ def long_enough(record):
 
 def rows_of(record):
     """φ and y of the usable rows, without stretches that are too short."""
-    problem = pose(long_enough(record), PHYSICS)
+    problem = estimate(long_enough(record), PHYSICS, learner=None).problem
     return np.asarray(problem.baseline.phi(problem.rows.x, problem.layout, ("y",), np))[
         :, 0
     ], problem.rows.y[:, 0]

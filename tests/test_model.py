@@ -8,14 +8,17 @@ import naive
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.reports.result import ScoreResult
+from orthaug import (
+    MLP,
+    Baseline,
+    Channel,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Record,
+    Term,
+    estimate,
+)
 
 FEW = LevenbergMarquardt(iterations=5)
 NETWORK = MLP(hidden=(3,))
@@ -295,11 +298,7 @@ def test_divergence_is_named(factors, diverging):
     ):
         assert np.isnan(part[29:]).all()
     scores = model.simulate(Record.from_arrays(y=np.ones((60, 2)), outputs=["p", "q"])).scores()
-    assert ScoreResult.model_validate(scores).content() == {
-        "rmse": None,
-        "nrmse": None,
-        "fit": None,
-    }
+    assert np.isnan([scores.rmse, scores.nrmse, scores.fit]).all()
 
 
 def test_a_run_that_overflows():

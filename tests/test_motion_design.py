@@ -7,7 +7,7 @@ import pytest
 from test_motion_fit import TS, WHOLE, spring
 
 import orthaug as oa
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.analysis.design import Design
 
 TRUTH = np.array([1.0, 0.8, 25.0])

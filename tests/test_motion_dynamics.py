@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 import scipy.integrate
@@ -12,11 +13,10 @@ import scipy.signal
 
 import orthaug as oa
 import orthaug.fitting.segments as laid
-from orthaug._base.jax import jax
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Numbers
-from orthaug.models.integrators import held
+from orthaug.models.integrators import inputs_at_points
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
@@ -66,7 +66,7 @@ def run(form: MotionDynamics, made: Numbers, data: oa.Record, start) -> np.ndarr
 
     @jax.jit
     def states(made: Numbers, start, inputs):
-        made = form.prepared(made)
+        made = form.prepare(made)
         return jax.lax.scan(lambda x, row: (form.step(made, x, row)[0], x), start, inputs)[1]
 
     return np.asarray(states(made, np.asarray(start), inputs))
@@ -123,9 +123,9 @@ def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(
 
 def test_inputs_between_samples() -> None:
     u = np.cumsum(np.random.default_rng(2).normal(size=(7, 2)), axis=0)
-    assert np.array_equal(held(u, "zero-order", 3), u)
-    np.testing.assert_array_equal(held(u, "first-order", 3)[2], [*u[2], *u[3]])
-    spline = held(u, "spline", 2).reshape(7, 5, 2)
+    assert np.array_equal(inputs_at_points(u, "zero-order", 3), u)
+    np.testing.assert_array_equal(inputs_at_points(u, "first-order", 3)[2], [*u[2], *u[3]])
+    spline = inputs_at_points(u, "spline", 2).reshape(7, 5, 2)
     np.testing.assert_allclose(spline[:, 0], u, atol=1e-12)
     np.testing.assert_allclose(spline[:-1, -1], u[1:], atol=1e-12)
 

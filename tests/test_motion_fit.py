@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug.analysis.learned_part import learned_reach
+from orthaug.analysis.missing_terms import doubted_equations, sensitivities
+from orthaug.analysis.motion_diagnosis import _colour, _traces
+from orthaug.analysis.predictability import Predictable
+from orthaug.analysis.residuals import analyse
+from orthaug.analysis.robustness import robust_free_run
 from orthaug.data.expressions import parse_named
-from orthaug.inference.motion_split import shared_of_motion
+from orthaug.fitting.motion_estimates import fitted_numbers
+from orthaug.fitting.motion_measures import field_under
+from orthaug.inference.motion_split import nearest, shared_of_motion
 from orthaug.models.learners import Bound
+from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import MotionDynamics
 from orthaug.selection.learned_linearization import linearization_of
 
@@ -186,10 +195,6 @@ def test_a_split_under_another_measure_moves_only_what_is_shared(fitted: oa.Moti
 
 def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEstimate) -> None:
     """∂q̂/∂(c, w) against differences of the whole split, the trajectories moved with the unknowns."""
-    from orthaug.fitting.motion_estimates import fitted_numbers
-    from orthaug.fitting.motion_measures import field_under
-    from orthaug.inference.motion_split import nearest
-
     segmented, numbers = fitted.segmented, fitted_numbers(fitted.model.numbers)
     unknowns = np.concatenate([numbers.theta, numbers.weights])
     bounds = fitted.problem.motion.coordinates.bounds
@@ -323,9 +328,6 @@ def test_the_band_of_what_is_learned_follows_all_that_was_estimated(
     fitted: oa.MotionEstimate,
 ) -> None:
     """Its variance is that of the learner's part when (c, w), and p̂ with them, move by columns of a root of Cov."""
-    from orthaug.analysis.learned_part import learned_reach
-    from orthaug.models.motion_field import parts_at
-
     x, u = np.stack([np.zeros(5), np.linspace(-1, 1, 5)], axis=1), np.zeros((5, 1))
     numbers, slope, tiny = fitted.model.numbers, fitted.split_by.slope, 1e-4
     joint = fitted.model.statistics.joint(3)
@@ -368,7 +370,9 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     assert model.predict(record).scores().rmse[0] < 1.5 * 0.002 + 0.002
     (trajectory,) = free.trajectories
     np.testing.assert_allclose(trajectory.baseline + trajectory.learner, trajectory.model)
-    alone = model.alone.simulate(record, initial=record.experiments[0].outputs).trajectories[0]
+    alone = model.physics_only.simulate(record, initial=record.experiments[0].outputs).trajectories[
+        0
+    ]
     assert np.abs(trajectory.learner).max() > 0.01 and alone.learner.any() == False  # noqa: E712  (an array)
     zero = model.simulate(
         oa.Record.from_arrays(u=record.experiments[0].inputs[:, 0], sampling_time=TS), "zero"
@@ -383,17 +387,12 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
 def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
     fitted: oa.MotionEstimate,
 ) -> None:
-    from orthaug.analysis.motion_diagnosis import diagnose_motion
-    from orthaug.analysis.robustness import robust_free_run
-
-    found = diagnose_motion(fitted, fitted.model.simulate(data()))
+    found = oa.diagnose(fitted)
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
-    again = oa.diagnose(fitted)
-    assert again is not None and again.text == found.text
     assert robust_free_run(fitted) is fitted
     assert found.missing is not None and not found.missing.found(0.01, 0.05)
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
-    found = diagnose_motion(alone, alone.model.simulate(data()))
+    found = oa.diagnose(alone, free_run=alone.model.simulate(data()))
     assert (
         found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
     )
@@ -440,10 +439,6 @@ def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
 )
 def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words: str) -> None:
     """A slight colour is surely there in many rows, and yet the past predicts nothing."""
-    from orthaug.analysis.motion_diagnosis import _colour
-    from orthaug.analysis.predictability import Predictable
-    from orthaug.analysis.residuals import analyse
-
     e = np.random.default_rng(2).normal(size=(4000, 2))
     e[1:, 0] += 0.2 * e[:-1, 0]
     tests = analyse([e], [np.zeros((4000, 0))], [np.zeros((4000, 0))], ["y", "z"], [], [])
@@ -456,23 +451,17 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
 
 
 def test_several_experiments_are_diagnosed_as_one_is() -> None:
-    from orthaug.analysis.motion_diagnosis import diagnose_motion
-
     record = oa.Record.join([data(160, friction=0.0), data(120, friction=0.0, seed=1)])
     fit = oa.estimate(record, spring(), learner=None, criterion=WHOLE)
-    found = diagnose_motion(fit, fit.model.simulate(record))
+    found = oa.diagnose(fit)
     assert found is not None and found.verdict == "white" and found.predictable[0].inputs == 0
     friction = oa.Record.join([data(160), data(120, seed=1)])
     fit = oa.estimate(friction, spring(), learner=None, criterion=WHOLE)
-    found = diagnose_motion(fit, fit.model.simulate(friction))
+    found = oa.diagnose(fit)
     assert found is not None and found.verdict == "unmodelled"
 
 
 def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
-    from orthaug.analysis.motion_diagnosis import _traces
-    from orthaug.analysis.predictability import Predictable
-    from orthaug.analysis.residuals import analyse
-
     random = np.random.default_rng(3)
     e, u, x = (
         random.normal(size=(4000, 2)),
@@ -493,10 +482,8 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
 
 def test_a_term_that_is_there_already_moves_the_run_as_its_parameter_does() -> None:
     """Linear in x, added to the equation of v: the spring's own column, −k/m of it by the logarithm of k."""
-    from orthaug.analysis.missing_terms import doubted, sensitivities
-
     fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
-    assert doubted(fit) == (1,)  # ẋ = v only says what v is
+    assert doubted_equations(fit) == (1,)  # ẋ = v only says what v is
     found = sensitivities(fit, (1,), lambda points: lambda rows: rows[:1], 1)
     assert found is not None and (found.starts, found.nuisance) == (2, 5)
     own, added = found.columns[..., 4], found.columns[..., 5]

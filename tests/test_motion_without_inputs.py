@@ -11,7 +11,7 @@ import scipy.integrate
 from test_motion_cli import orthaug
 
 import orthaug as oa
-from orthaug.data.readers import read_record
+from orthaug import read_record
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

@@ -16,9 +16,9 @@ from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 import orthaug as oa
+from orthaug import MLP
 from orthaug._base.views import MAKERS
 from orthaug.commands import bars
-from orthaug.models.learners import MLP
 from orthaug.reports.findings import BiasResult
 from orthaug.reports.html import card_of_result, html_of
 from orthaug.reports.result import FitResult, ParameterResult, WarningResult

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug import (
+    MLP,
+    Baseline,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+    synthetic,
+)
 from orthaug.fitting.one_step import OUTPUT_UNIT, OneStepTask
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Scaling
+from orthaug.models.learners import Scaling
 from orthaug.models.rows import from_chunks
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
-from orthaug.studies.synthetic import mass_spring_damper
 
 TERMS = [
     Term("a", "y1[k-1]", output="y1"),
@@ -117,7 +123,7 @@ def test_mean_square_is_that_of_the_projected_residual(task, run):
 
 
 def test_gram_has_no_rows_of_a_penalty():
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     task = OneStepTask.of(pose(example.train.rows(0, 400), example.baseline), MLP(hidden=(3,)))
     w = task.bound.init(jax.random.key(0))
     free, held = (

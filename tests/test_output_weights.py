@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 from test_cli import finite_json, run
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Record
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate, reweighted
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, OrthogonalPenalty
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    InputError,
+    LevenbergMarquardt,
+    OrthogonalPenalty,
+    Record,
+    Simulation,
+    Term,
+    Uniform,
+    estimate,
+    load,
+    save,
+)
+from orthaug.fitting.estimation import reweight
 from orthaug.inference.covariance import joint_covariance
-from orthaug.inference.measures import Uniform
-from orthaug.models.learners import MLP
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.problem import pose
 
 ROWS = 300
 LEARNER, SOLVER = MLP((3,)), LevenbergMarquardt(200)
@@ -63,6 +68,11 @@ def weighted_least_squares(matrix: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(rows.reshape(-1, 2), target.ravel(), rcond=None)[0]
 
 
+def weight_of(choice):
+    """The weight of the outputs in a fit of physics alone."""
+    return estimate(two_outputs(), BASELINE, learner=None, output_weights=choice).problem.weight
+
+
 def learner_values(fit) -> np.ndarray:
     """F̃ (N, 2), the learner's part of the prediction."""
     return fit.model.components(fit.problem.record).trajectories[0].learner
@@ -87,7 +97,7 @@ def test_theta_is_weighted_least_squares_whatever_the_learner_does(choice):
     ids=["none", "numbers", "std"],
 )
 def test_what_is_chosen(choice, matrix):
-    weight = pose(two_outputs(), BASELINE, output_weights=choice).weight
+    weight = weight_of(choice)
     np.testing.assert_allclose(
         weight.matrix / weight.matrix[0, 0], matrix / matrix[0, 0], atol=1e-15
     )
@@ -149,7 +159,7 @@ def test_covariance_does_not_depend_on_the_outputs_units():
 def test_numbers_weigh_squared_errors():
     """Equal numbers are "none"; a hundred times the first one's leaves θ to the first output."""
     np.testing.assert_allclose(
-        *(pose(two_outputs(), BASELINE, output_weights=c).weight.matrix for c in ("none", [3, 3])),
+        *(weight_of(c).matrix for c in ("none", [3, 3])),
         rtol=1e-14,
     )
     many = estimate(two_outputs(), BASELINE, learner=None, output_weights=[1e6, 1e-3])
@@ -161,7 +171,7 @@ def test_numbers_weigh_squared_errors():
 
 def test_penalties_count_in_the_units_of_the_sum_that_is_asked_for():
     """λ against the plain sum of squares under "none", as in the published scripts."""
-    weight = pose(two_outputs(), BASELINE, output_weights="none").weight
+    weight = weight_of("none")
     np.testing.assert_allclose(weight.matrix, weight.unit * np.eye(2))
     structure = OrthogonalPenalty(weight=3.0)
     fit = estimate(
@@ -231,14 +241,14 @@ def test_the_free_run_takes_them_too():
         for choice in ("none", "std", "auto")
     ]
     for choice, theta in zip(("none", "std"), thetas, strict=False):
-        matrix = pose(two_outputs(), BASELINE, output_weights=choice).weight.matrix
+        matrix = weight_of(choice).matrix
         np.testing.assert_allclose(theta, weighted_least_squares(matrix), rtol=1e-6)
     assert np.abs(thetas[2] - thetas[1]).max() > 1e-4  # by the covariance of the errors
 
 
 def test_turns_that_do_not_settle_are_told():
     first, second = (estimate(two_outputs(unit), BASELINE, learner=None) for unit in (20.0, 30.0))
-    last = reweighted(first, lambda problem, before: second if before is first else first)
+    last = reweight(first, lambda problem, before: second if before is first else first)
     assert [w.code for w in last.warnings] == ["output_weights_unsettled"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -11,9 +12,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from test_cli import run
 
 import orthaug
-from orthaug.commands.schema import keys_of_a_spec, schema_of_a_spec
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -116,12 +117,11 @@ def test_the_wheel_carries_what_tells_of_every_key():
     told = [
         line for line in text("docs/spec.md").rstrip().split("\n") if not line.startswith("<!--")
     ]
-    assert keys_of_a_spec().split("\n") == told  # which init's specs and the app point at
-    properties = schema_of_a_spec()["properties"]
+    keys = run("schema", "keys").out.rstrip()
+    assert keys.split("\n") == told  # which init's specs and the app point at
+    properties = json.loads(run("schema", "spec").out)["properties"]
     assert {"data", "baseline", "motion", "learner", "structure", "training"} <= set(properties)
-    assert {
-        name for name in properties if f"## [{name}]" not in keys_of_a_spec().replace("[[", "[")
-    } == set()
+    assert {name for name in properties if f"## [{name}]" not in keys.replace("[[", "[")} == set()
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/install.md"])

@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug.data.record import Record
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    LevenbergMarquardt,
+    Record,
+    Term,
+    estimate,
+    orthogonalize,
+    synthetic,
+)
 from orthaug.physics.projection import Projection
-from orthaug.studies.synthetic import mass_spring_damper, static
 
 SEEDS = range(4)
 LEARNERS = [
@@ -41,7 +44,7 @@ def rmse(fit, record: Record) -> float:
 
 @pytest.fixture(scope="module", params=[1, 2, 3])
 def noiseless(request):
-    example = static(request.param)
+    example = synthetic.static(request.param)
     options = {"regularization": "none"}
     return (
         request.param,
@@ -52,14 +55,14 @@ def noiseless(request):
 
 @pytest.fixture(scope="module")
 def noisy():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fits = [estimate(example.train, example.baseline, seed=seed) for seed in SEEDS]
     return example, fits
 
 
 @pytest.fixture(scope="module")
 def additive():
-    example = static(1)
+    example = synthetic.static(1)
     return example, [
         estimate(
             example.train, example.baseline, structure=Additive(), regularization="none", seed=s
@@ -70,7 +73,7 @@ def additive():
 
 @pytest.fixture(scope="module")
 def spring():
-    example = mass_spring_damper()
+    example = synthetic.mass_spring_damper()
     solver = LevenbergMarquardt(iterations=100)
     return example, [
         estimate(example.train, example.baseline, solver=solver, seed=seed) for seed in range(2)
@@ -178,7 +181,7 @@ def test_lemma_1(noiseless, spring):
 @pytest.mark.parametrize("learner", LEARNERS[:3], ids=NAMES[:3])
 def test_theorem_1(data_set, learner):
     """‖θ* − θ̂‖ = ‖Φ⁺Δ‖ (eq:error_val): without noise it holds however good the fit is."""
-    example = static(data_set)
+    example = synthetic.static(data_set)
     fit = estimate(
         example.train,
         example.baseline,

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
+from orthaug import MLP, Additive, Baseline, InputError, LevenbergMarquardt, Record, Term, estimate
 from orthaug.fitting.elimination import eliminate
-from orthaug.fitting.estimation import estimate
 from orthaug.fitting.normal_equations import one_pass
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.paper_criterion import JointOneStep, Physics
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive
-from orthaug.models.learners import MLP
 from orthaug.models.rows import Overlap
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 LEARNER, STRUCTURE = MLP((3,)), Additive(from_initial=True)

@@ -13,14 +13,9 @@ import pytest
 import scipy.linalg  # noqa: F401  (brings a BLAS of its own)
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from orthaug import MLP, AdamLBFGS, Baseline, LevenbergMarquardt, Record, Term, estimate
 from orthaug._base import parallel
-from orthaug._base.parallel import RunCancelled, one_blas_thread, spread
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
+from orthaug._base.parallel import RunCancelled, one_blas_thread, run_all
 
 
 @pytest.fixture
@@ -53,7 +48,7 @@ def test_results_keep_the_order_of_the_items(cores):
         time.sleep(0.05 * (6 - item))
         return item, threading.get_ident()
 
-    found = spread(slow_first, range(6))
+    found = run_all(slow_first, range(6))
     assert [item for item, _ in found] == list(range(6))
     assert 1 < len({ident for _, ident in found}) <= 4
 
@@ -62,7 +57,7 @@ def test_results_keep_the_order_of_the_items(cores):
 def test_one_item_or_one_core_runs_inline(cores, items, count):
     cores(count)
     here = threading.get_ident()
-    assert spread(lambda item, check: (check(), item, threading.get_ident())[1:], items) == [
+    assert run_all(lambda item, check: (check(), item, threading.get_ident())[1:], items) == [
         (i, here) for i in items
     ]
 
@@ -96,7 +91,7 @@ def test_an_exception_reaches_the_caller_and_stops_the_others(cores, failing, ex
         until_stopped(ended, check)
 
     with pytest.raises(exception):
-        spread(function, range(3))
+        run_all(function, range(3))
     assert ended == {"stopped": 2}
 
 
@@ -112,7 +107,7 @@ def test_runs_that_wait_for_a_core_never_start(cores):
         until_stopped(ended, check)
 
     with pytest.raises(Odd):
-        spread(function, range(12))
+        run_all(function, range(12))
     assert ended["went on to its end"] == 0
     assert sum(count for text, count in ended.items() if text.startswith("started")) <= 3
 
@@ -130,7 +125,7 @@ def test_ctrl_c_in_the_main_thread_stops_the_runs(cores, monkeypatch):
 
     try:
         with pytest.raises(KeyboardInterrupt):
-            spread(function, range(2))
+            run_all(function, range(2))
     finally:
         signal.signal(signal.SIGINT, previous)
     assert ended == {"stopped": 2}

@@ -9,12 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP
-from orthaug.studies.synthetic import mass_spring_damper
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    BaselinePenalty,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    estimate,
+    synthetic,
+)
 
 PIPELINE = AdamLBFGS(
     adam_iterations=100, lbfgs_iterations=60
@@ -28,7 +33,7 @@ PENALTIES = (OrthogonalPenalty, BaselinePenalty)
 
 @lru_cache
 def example():
-    return mass_spring_damper()
+    return synthetic.mass_spring_damper()
 
 
 @lru_cache

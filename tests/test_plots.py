@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from orthaug.data.record import Channel
-from orthaug.models.response import Response, Trajectory
+from orthaug import Channel, Response, Trajectory
 from orthaug.reports import finding_plots, plots
 from orthaug.reports.findings import SuspectResult
 from orthaug.reports.result import ParameterResult, RowResult

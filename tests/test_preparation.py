@@ -11,7 +11,7 @@ from helpers import unfolded
 from test_cli import make_project, run
 
 import orthaug as oa
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.data.preparation import steps_again, warnings_of
 from orthaug.data.prepared import Prepared
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError, RankError
-from orthaug._base.jax import jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.physics.baseline import Baseline, Term
+from orthaug import Baseline, InputError, Lags, RankError, Record, Term
 from orthaug.physics.problem import pose
 
 RNG = np.random.default_rng(0)

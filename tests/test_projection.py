@@ -13,9 +13,8 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug.data.record import Record
+from orthaug import Baseline, Record, Term
 from orthaug.data.regressors import in_order, stack_rows
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.projection import Factor, Projection
 
 POLYNOMIAL = ["1", "x[k]", "x[k]**2", "x[k]**3", "x[k]**4", "x[k]**5"]

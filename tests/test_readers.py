@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.parquet_source import open_parquet
-from orthaug.data.readers import read_record
-from orthaug.data.record import Channel
+from orthaug import Channel, InputError, open_parquet, read_record
 
 CONTENT = "t,u,y\n" + "".join(f"{k / 10},{k},{10 * k}\n" for k in range(10))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Experiment, Record, same_step
+from orthaug import Channel, Experiment, InputError, Record
+from orthaug.data.record import same_step
 
 STEPS = np.arange(6.0)
 

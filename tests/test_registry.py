@@ -8,25 +8,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from annotated_types import Ge, Gt
 from test_cli import SPEC, finite_json, make_project, one_line, run
 
-from orthaug._base.errors import InputError, KeyedError
-from orthaug._base.jax import jnp
+from orthaug import (
+    AdamLBFGS,
+    InputError,
+    LevenbergMarquardt,
+    Prediction,
+    Simulation,
+    Training,
+    load,
+    load_spec,
+    read_record,
+)
 from orthaug._base.registry import LIBRARY_ONLY, OneOf, Registry, SpecLimit, check_fields, keys_of
-from orthaug.commands.spec import load_spec
-from orthaug.data.readers import read_record
-from orthaug.fitting.criteria import Prediction, Simulation
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import PenaltyRows
 from orthaug.inference.kinds import MEASURES
-from orthaug.inference.measures import Measure, Points, Training
+from orthaug.inference.measures import Measure, Points
 from orthaug.models.kinds import LEARNERS
-from orthaug.models.storage import load
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -99,8 +103,10 @@ def test_a_learner_from_outside(project, tmp_path):
         '[learner]\nkind = "powers"\nhighest = 2\ncentre = [1, 2.5]\nhidden = [9]\ninputs = ["u[k-1]", "y[k-1]"]\n',
     )
     assert run("fit", spec).code == 2
-    with LEARNERS.added("powers", Powers):
-        assert load_spec(spec).declared_learner() == Powers(2, (1.0, 2.5), ("u[k-1]", "y[k-1]"))
+    with LEARNERS.with_kind("powers", Powers):
+        assert load_spec(spec).spec.declared_learner() == Powers(
+            2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
+        )
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         model = load(tmp_path / "out")
@@ -123,7 +129,7 @@ def test_a_learner_from_outside(project, tmp_path):
 
 
 def test_the_keys_of_a_learner_from_outside_are_checked(project):
-    with LEARNERS.added("powers", Powers):
+    with LEARNERS.with_kind("powers", Powers):
         for key, words in (
             ("highest = 1", "'learner.highest': found 1; expected greater than or equal to 2"),
             ("highest = 2.5", "'learner.highest': found 2.5; expected an integer"),
@@ -145,8 +151,8 @@ def test_a_structure_from_outside(project, tmp_path):
     spec = with_sections(
         project, "nearness", '[structure]\nkind = "nearness"\nstiffness = 1e9\n' + TRAINED
     )
-    with STRUCTURES.added("nearness", Nearness):
-        assert load_spec(spec).declared_structure() == Nearness(1e9)
+    with STRUCTURES.with_kind("nearness", Nearness):
+        assert load_spec(spec).spec.declared_structure() == Nearness(1e9)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         result = finite_json(done.out)
@@ -172,7 +178,7 @@ def test_a_structure_from_outside(project, tmp_path):
 def test_a_measure_from_outside(project, tmp_path):
     sections = '[structure.measure]\nkind = "enlarged"\nfactor = 3\n' + TRAINED
     spec = with_sections(project, "enlarged", sections)
-    with MEASURES.added("enlarged", Enlarged):
+    with MEASURES.with_kind("enlarged", Enlarged):
         assert isinstance(Enlarged(), Measure)
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
@@ -274,7 +280,7 @@ REFUSED = [
 )
 def test_entries_that_are_refused(registry, kind, declaration, message):
     before = dict(registry)
-    with pytest.raises(InputError, match=message), registry.added(kind, declaration):
+    with pytest.raises(InputError, match=message), registry.with_kind(kind, declaration):
         pass
     assert dict(registry) == before
 
@@ -295,7 +301,7 @@ def test_keys_and_limits_of_a_declaration():
     assert list(keys_of(Whole)) == ["path", "count", "size", "shape"]
     registry = Registry("thing", {"whole": Whole})
     assert registry.declare("whole", {"path": "a", "count": 0, "unknown": 1}) == Whole("a", 0)
-    with pytest.raises(KeyedError, match="the thing 'whole' needs `path`"):
+    with pytest.raises(InputError, match="the thing 'whole' needs `path`"):
         registry.declare("whole", {})
     with pytest.raises(InputError, match="unknown thing 'whol', did you mean 'whole'?"):
         registry.declare("whol", {})

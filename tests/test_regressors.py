@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
+from orthaug import InputError, Lags, Record
 from orthaug.data.expressions import Lag, parse
-from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags, in_order, lag_matrix, largest_lag, stack_rows
+from orthaug.data.regressors import Features, in_order, lag_matrix, largest_lag, stack_rows
 from orthaug.models.learners import Scaling
 
 

@@ -18,19 +18,17 @@ from test_motion_cli import SPEC as MOTION
 from test_motion_cli import put
 
 import orthaug as oa
+from orthaug import Channel, Response, Trajectory
 from orthaug.commands.compare import compare_report
-from orthaug.commands.fit import fit_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
-from orthaug.data.record import Channel
-from orthaug.models.response import Response, Trajectory
 from orthaug.reports.findings import BiasResult
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, fit_sections
-from orthaug.reports.page_runs import Run, compared_plots, error_band, packed, run_plots
+from orthaug.reports.page_runs import Run, compared_plots, error_band, pack_curve, run_plots
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
@@ -99,8 +97,8 @@ def compared(lagged):
 @pytest.fixture(scope="module")
 def pages(lagged, motion, compared):
     return {
-        "lagged": fit_report(lagged),
-        "motion": fit_report(motion),
+        "lagged": lagged.report().html,
+        "motion": motion.report().html,
         "compared": compare_report(compared),
     }
 
@@ -179,7 +177,7 @@ def test_curves_hold_the_whole_record_in_finite_numbers(pages, lagged, motion, c
 def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
     part = lagged.job.parts[-1].record
     own = (
-        lagged.fit.model.alone.simulate(part).trajectories[0].model
+        lagged.fit.model.physics_only.simulate(part).trajectories[0].model
     )  # of a motion from the same start
     for kind, fitted, alone in (("lagged", lagged, own), ("motion", motion, None)):
         (run,) = fitted.responses[fitted.job.parts[-1].name][1].trajectories
@@ -278,7 +276,7 @@ def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(l
         for row in lagged.result.parameters
     ]
     told = Read(
-        fit_report(replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})))
+        replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})).report().html
     )
     assert "(mm/N)" in told.text("td") and any(
         "it follows from the units of the channels" in c for c in told.text("caption")
@@ -403,7 +401,7 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
 
 def test_packed_curves_keep_their_digits_beside_an_offset():
     given = 1e6 + np.sin(np.arange(100.0))
-    assert values(packed(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
+    assert values(pack_curve(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
 
 
 def test_the_band_holds_most_errors_of_training():
@@ -495,14 +493,14 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
     told = "train: findings and figures use 10 of 99 rows, in windows spread over them."
-    page = Read(fit_report(replace(lagged, result=with_warning(lagged, "witness", told))))
+    page = Read(replace(lagged, result=with_warning(lagged, "witness", told)).report().html)
     (section,) = page.text("section", id="free-run")
     assert told in section
 
 
 def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
     told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
-    page = fit_report(replace(lagged, result=with_warning(lagged, "small_margin", told)))
+    page = replace(lagged, result=with_warning(lagged, "small_margin", told)).report().html
     assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
     whole = [
         "".join(text)

@@ -12,11 +12,9 @@ import pytest
 from test_cli import MLP, SPEC, make_project
 
 import orthaug as oa
+from orthaug import Channel, Response, Trajectory
 from orthaug.commands.compare import compare_report
-from orthaug.commands.fit import fit_report
 from orthaug.commands.job import origin_of
-from orthaug.data.record import Channel
-from orthaug.models.response import Response, Trajectory
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_fit import FitPage
 
@@ -53,7 +51,7 @@ def folder(tmp_path_factory) -> Path:
         origin_of(fitted.job, "fit"), fitted.result, {p: long_run(p) for p in fitted.responses}
     )
     pages = {
-        "fit": fit_report(fitted),
+        "fit": fitted.report().html,
         "compared": compare_report(oa.compare(fitted.job)),
         "long": fit_page(long),
     }

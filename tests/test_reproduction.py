@@ -26,7 +26,7 @@ import pandas as pd
 import pytest
 from test_cli import run as run_command
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.studies.common import Counts, Finding, extremes, panels, scripts_bars, whiskers
 from orthaug.studies.references import Spread
 from orthaug.studies.reproduction import (
@@ -35,10 +35,10 @@ from orthaug.studies.reproduction import (
     StudyOutcome,
     as_rows,
     catalogue,
-    chosen,
+    choose_studies,
     reproduce,
     text,
-    when,
+    when_text,
     write,
 )
 from orthaug.studies.study import Run, run
@@ -84,7 +84,7 @@ def reduced(store: Path) -> list[StudyOutcome]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthaug.inference.measures._NODES", (1 << 12, 512, 64))
         patch.setattr("orthaug.studies.regularization_weight.ITERATIONS", 15)
-        return reproduce(chosen(None), small=True, store=store)
+        return reproduce(choose_studies(None), small=True, store=store)
 
 
 def stored_columns(one: StudyOutcome) -> dict[str, list]:
@@ -119,7 +119,7 @@ def references() -> dict:
 
 def test_the_catalogue_is_in_the_papers_order():
     assert tuple(catalogue()) == NAMES
-    assert [entry.name for entry in chosen(None)] == list(NAMES)
+    assert [entry.name for entry in choose_studies(None)] == list(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -365,8 +365,8 @@ def test_the_text_fits_a_terminal_and_counts(found):
 def test_when_runs_were_made_is_said_apart_for_stored_ones():
     now = [Run({}, {}, "2025-03-04T10:00:00+00:00", 1.5, stored=False)]
     old = [Run({}, {}, f"2025-03-0{day}T10:00:00+00:00", 10.0, stored=True) for day in (1, 3, 2)]
-    assert when(now) == "1 run: 1 made now, on 2025-03-04 in 1.5 s, summed over runs"
-    assert when(now + old) == (
+    assert when_text(now) == "1 run: 1 made now, on 2025-03-04 in 1.5 s, summed over runs"
+    assert when_text(now + old) == (
         "4 runs: 1 made now, on 2025-03-04 in 1.5 s; "
         "3 read from the store, made on 2025-03-01 to 2025-03-03 in 30 s, summed over runs"
     )
@@ -457,11 +457,11 @@ def test_the_folder_holds_figures_runs_and_findings(found, page):
     assert content["counts"]["beyond"] == sum(
         finding.beyond for one in found for finding in one.findings
     )
-    assert content["runs"] == {one.entry.name: when(one.runs) for one in found}
+    assert content["runs"] == {one.entry.name: when_text(one.runs) for one in found}
 
 
 def test_runs_of_a_store_are_the_same_file_and_said_to_be_stored(found, page, store, tmp_path):
-    again = reproduce(chosen("static_noise"), small=True, store=store)
+    again = reproduce(choose_studies("static_noise"), small=True, store=store)
     write(again, tmp_path / "again", "ours")
     place = "static_noise/runs.csv"
     assert (tmp_path / "again" / place).read_bytes() == (page / place).read_bytes()
@@ -486,7 +486,7 @@ def test_a_second_run_reads_the_store(found, store, monkeypatch):
 )
 def test_an_unknown_study_has_a_nearest_one(name, hint):
     with pytest.raises(InputError, match=f"no study '{name}', did you mean '{hint}'"):
-        chosen(name)
+        choose_studies(name)
 
 
 def test_an_unknown_pipeline_is_refused():

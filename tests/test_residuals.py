@@ -9,8 +9,7 @@ import pytest
 import scipy.stats
 from scipy.signal import lfilter
 
-from orthaug._base.errors import InputError
-from orthaug._base.parallel import one_blas_thread
+from orthaug import InputError
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.whiteness import (
@@ -18,7 +17,7 @@ from orthaug.analysis.whiteness import (
     cross_correlation,
     ljung_box,
     normality,
-    whitening,
+    whitening_filter,
 )
 from orthaug.reports.residual_tests import ResidualTestResult
 
@@ -27,13 +26,6 @@ BETWEEN = (
     0.005,
     0.016,
 )  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
-
-
-@pytest.fixture(autouse=True)
-def small_products():
-    """Where other processes run, threads that wait for each other take ten times as long."""
-    with one_blas_thread():
-        yield
 
 
 def coloured(white, *a):
@@ -232,7 +224,7 @@ def test_independence_keeps_its_level(colour, record_property):
     for _ in range(RECORDS // 2):
         e, white, slow = rng.normal(size=(3, ROWS + WARM_UP))
         e, slow = (s[WARM_UP:] for s in (coloured(e, *COLOURS[colour]), coloured(slow, -0.95)))
-        white, a = white[WARM_UP:], whitening(e)
+        white, a = white[WARM_UP:], whitening_filter(e)
         first, second = (against_input(e, u, a=a) for u in (white, slow))
         third, fourth = (against_regressor(e, x, centred=True, a=a) for x in (white, slow))
         fifth = against_regressor(e, np.sign(slow), centred=True, a=a)
@@ -257,10 +249,10 @@ def test_without_the_colour_of_the_residual_the_level_is_lost():
 def test_the_order_of_the_colour_is_found():
     rng = np.random.default_rng(15)
     e = [coloured(one, -1.2, 0.8)[WARM_UP:] for one in rng.normal(size=(4, 1500))]
-    a = whitening(e)
+    a = whitening_filter(e)
     np.testing.assert_allclose(a[:3], [1.0, -1.2, 0.8], atol=0.06)
     assert len(a) < 9 and np.abs(np.roots(a)).max() < 1
-    assert len(whitening(rng.normal(size=1000))) == 1
+    assert len(whitening_filter(rng.normal(size=1000))) == 1
 
 
 def test_a_slightly_coloured_residual_is_not_white():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthaug._base.jax import jax, jnp
 from orthaug.models.rows import CHUNK_ROWS, chunk_shape, from_chunks, gram, in_chunks, row_sum
 
 AWKWARD = [1, 7, 8, 9, 63, 64, 65, 127, 128, 129, 200]

@@ -7,21 +7,18 @@ from functools import cache, partial
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import naive
 import numpy as np
 import pytest
 
 import orthaug.fitting.segments
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
+from orthaug import MLP, Baseline, Lags, LevenbergMarquardt, Record, Term, estimate
 from orthaug.fitting.segments import Segments, build_segments, respond, sensitivity
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
-from orthaug.models.learners import MLP, Bound
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.models.learners import Bound
 from orthaug.physics.problem import pose
 
 SEGMENT, WASHOUT, LENGTHS = 7, 3, (23, 9, 30)

@@ -17,8 +17,6 @@ from orthaug.physics.problem import pose
 from orthaug.selection.candidates import SHORTLIST, candidates
 from orthaug.selection.forward import Equations, forward
 from orthaug.selection.nonlinearity import nonlinearity
-from orthaug.selection.term_path import climb
-from orthaug.selection.term_runs import TermRuns
 
 PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
 LAGS, FLOWN = oa.Lags(2, 2, 1), oa.Simulation(128, 20)
@@ -552,14 +550,10 @@ def test_a_motion_is_refused(tmp_path):
 
 
 def test_a_path_is_the_same_twice():
-    record = plant(300)
-    problem = pose(record, PHYSICS)
-    library = TermLibrary.of(["y[k-2]", "u[k-2]", "u[k-1]"], 2, exclude=["u[k-1]"])
-    paths = [climb(TermRuns.of(problem, library, oa.Prediction()), 4, 3) for _ in range(2)]
-    assert [rung.point.chosen for rung in paths[0].rungs] == [
-        rung.point.chosen for rung in paths[1].rungs
-    ]
-    assert [rung.score for rung in paths[0].rungs] == [rung.score for rung in paths[1].rungs]
+    options = {"lags": LAGS, "criterion": oa.Prediction(), "most": 3}
+    one, other = (oa.select(plant(300), PHYSICS, **options) for _ in range(2))
+    pd.testing.assert_frame_equal(*(found.table.drop(columns="seconds") for found in (one, other)))
+    assert one.learner == other.learner and one.shares == other.shares
 
 
 def test_a_fit_says_where_terms_leave_little_of_the_physics(tmp_path):

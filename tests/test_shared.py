@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -12,21 +13,29 @@ import scipy.signal
 from test_cli import run
 
 import orthaug as oa
-from orthaug._base.jax import jnp
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    Function,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    PhysicalParameter,
+    PhysicsMap,
+    Record,
+    Simulation,
+    Term,
+    Training,
+    Uniform,
+    estimate,
+    load,
+    save,
+)
 from orthaug.analysis.imitation import imitation
 from orthaug.data.expressions import parse
-from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.inference.measures import Training, Uniform
-from orthaug.models.learners import MLP, Function
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.data.regressors import Features
 from orthaug.physics.left_over import left_over
-from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
 from orthaug.physics.problem import pose
 from orthaug.physics.shared import Shared, shared_directions
 
@@ -92,7 +101,7 @@ def test_directions_that_leave_some_entries_where_they_are(seed):
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-6, 6, 6)
     drawn = size[:, None] * rng.normal(size=(6, 4))
-    found = Shared(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).leaving([1, 5])
+    found = Shared(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).without_entries([1, 5])
     expected = drawn @ scipy.linalg.null_space((drawn / size[:, None])[[1, 5]])
     both = np.column_stack([found.basis, expected]) / size[:, None]
     assert found.basis.shape == (6, 2) and not found.basis[[1, 5]].any()
@@ -484,7 +493,7 @@ def test_independent_columns_are_hardly_ever_called_shared():
         )
         rest = left_over(noise[:, None, :], z)
         assert rest is not None
-        called += rest.imitated(np.zeros((3, 0))).shape[1] > 0
+        called += rest.imitated_directions(np.zeros((3, 0))).shape[1] > 0
     assert called == 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.analysis.signals import (
     binary_pattern,
     crest_factor,

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import sys
 
 import pytest
-
-from orthaug.commands import cli
+from test_cli import run
 
 SPEC = """
 [data]
@@ -50,16 +46,7 @@ def result(data_folder, tmp_path_factory):
         for i, r in enumerate(REGRESSORS)
     )
     (folder / "silverbox.toml").write_text(SPEC.format(file=file) + "".join(terms))
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
-        patch.setattr(
-            sys,
-            "argv",
-            ["orthaug", "fit", str(folder / "silverbox.toml"), "--out", str(folder / "out")],
-        )
-        patch.setattr("orthaug._base.jax.use_compilation_cache", lambda: None)
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-    assert stop.value.code == 0
+    assert run("fit", folder / "silverbox.toml", "--out", folder / "out").code == 0
     return json.loads((folder / "out" / "result.json").read_text(encoding="utf-8"))
 
 

@@ -8,12 +8,9 @@ from typing import get_args
 
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import Channel, InputError, Lags, Parameter, Term
 from orthaug.commands.spec import load_spec
-from orthaug.data.record import Channel
-from orthaug.data.regressors import Lags
 from orthaug.models.learners import ACTIVATIONS
-from orthaug.physics.baseline import Parameter, Term
 
 LEAST = """
 [data]

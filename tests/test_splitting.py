@@ -8,20 +8,29 @@ import numpy as np
 import pytest
 from test_cli import run
 
-from orthaug._base.errors import InputError, RankError
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.inference.measures import Samples, Symmetrized, Training, Uniform, Weighted
-from orthaug.models.learners import MLP
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.reports.result import MeasureResult
-from orthaug.studies.synthetic import static
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    RankError,
+    Record,
+    Samples,
+    Simulation,
+    Symmetrized,
+    Term,
+    Training,
+    Uniform,
+    Weighted,
+    estimate,
+    load,
+    orthogonalize,
+    save,
+    synthetic,
+)
 
 QUICK = LevenbergMarquardt()
 WIDE = Uniform({"u[k]": (-0.6, 0.6)})
@@ -67,7 +76,7 @@ def two():
 @pytest.fixture(scope="module")
 def curve():
     """The paper's static set 1 with 30 dB noise, briefly trained."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(example.train, example.baseline, learner=NET, solver=QUICK, regularization=1e-4)
 
 
@@ -190,7 +199,7 @@ def test_under_the_training_measure_nothing_changes(fit):
 
 
 def test_an_additive_fit_splits_to_least_squares():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     additive = estimate(
         example.train, example.baseline, learner=NET, solver=QUICK, structure=Additive()
     )
@@ -211,10 +220,7 @@ def test_a_split_says_what_it_is(curve):
         "uniform",
     )
     assert "measure     uniform, 1048576 points, 100 % of it within reach" in found.summary()
-    assert (
-        MeasureResult.model_validate(found.measure).content()["kind"] == "uniform"
-        and found.warnings == curve.warnings
-    )
+    assert found.warnings == curve.warnings
 
 
 def test_a_measure_beyond_the_data_is_warned_of(curve, coarser):
@@ -232,7 +238,7 @@ def test_a_measure_beyond_the_data_is_warned_of(curve, coarser):
 @pytest.mark.parametrize("data_set", [2, 3])
 def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
     """θ̂ errs by 0.0796 and 0.1433 under the training measure, however good the fit (F3)."""
-    example = static(data_set)
+    example = synthetic.static(data_set)
     for seed in range(2):
         fit = estimate(example.train, example.baseline, seed=seed, regularization="none", blocks=0)
         biased = {2: 0.0795547, 3: 0.1433322}[data_set]
@@ -241,7 +247,7 @@ def test_the_uniform_measure_finds_the_papers_parameters(data_set, coarser):
 
 
 def test_estimate_under_a_measure_is_the_split(coarser):
-    example = static(3, noise=True)
+    example = synthetic.static(3, noise=True)
     given = {"learner": NET, "solver": QUICK}
     direct = estimate(example.train, example.baseline, structure=Orthogonal(measure=WIDE), **given)
     split = estimate(example.train, example.baseline, **given).split(WIDE)
@@ -272,7 +278,7 @@ def test_a_model_trained_on_its_free_run():
 
 
 def test_an_ensemble_has_no_standard_errors_and_says_so(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     given = {"learner": NET, "solver": QUICK, "restarts": 3, "ensemble": True}
     fit = estimate(example.train, example.baseline, **given)
     found = fit.split(WIDE)
@@ -286,7 +292,7 @@ def test_an_ensemble_has_no_standard_errors_and_says_so(coarser):
 
 
 def test_physics_alone_keeps_theta_under_any_measure(coarser):
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, learner=None)
     found = fit.split(WIDE)
     np.testing.assert_allclose(found.theta, fit.theta, rtol=1e-13)
@@ -296,7 +302,7 @@ def test_physics_alone_keeps_theta_under_any_measure(coarser):
 
 
 def test_a_model_of_another_toolbox(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     fit = orthogonalize(
         example.train, example.baseline, lambda x: 0.01 + x - 0.5 * x**2 + 0.1 * x**3
     )
@@ -328,7 +334,7 @@ def test_a_learner_that_reads_other_lags_than_the_physics():
 
 
 def test_bounds_hold_under_the_training_measure_only(coarser):
-    example = static(3)
+    example = synthetic.static(3)
     bounded = Baseline.from_terms([Term("theta1", "u[k]", max=0.9), Term("theta3", "u[k]**3")])
     with pytest.raises(
         InputError,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jnp
-from orthaug.fitting.status import Ending, Status
+from orthaug import Status
+from orthaug.fitting.status import Ending
 
 MESSAGES = {
     "exact": "",

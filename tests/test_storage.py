@@ -8,17 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug import __version__
-from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug import (
+    MLP,
+    Baseline,
+    Channel,
+    Function,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Record,
+    Term,
+    __version__,
+    estimate,
+    load,
+    save,
+)
 from orthaug.models import storage
-from orthaug.models.learners import MLP, Function
-from orthaug.models.model import Model
-from orthaug.models.storage import load, save
-from orthaug.physics.baseline import Baseline, Term
 
 SOLVER = LevenbergMarquardt(3)
 FILES = ["arrays.safetensors", "model.json"]  # beside the manifest

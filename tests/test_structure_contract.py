@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from functools import lru_cache, partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
-from orthaug.fitting.estimation import estimate
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    Lags,
+    LevenbergMarquardt,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.problem import pose
 
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(3.0), BaselinePenalty(20.0))
@@ -164,7 +170,7 @@ def fit(structure, ny, shared, solver):
 @pytest.mark.parametrize(("structure", "ny", "shared"), CASES, ids=IDS)
 def test_every_solver_fits_every_structure(structure, ny, shared, solver):
     found, again = fit(structure, ny, shared, solver), fit(structure, ny, shared, solver)
-    assert found.status.code in {ending.code for ending in Ending} and found.status.ok
+    assert found.status.code in ("converged", "iteration_limit", "no_descent") and found.status.ok
     assert np.isfinite(found.theta).all() and np.isfinite(found.status.loss)
     np.testing.assert_array_equal(again.theta, found.theta)
     np.testing.assert_array_equal(again.model.numbers.weights, found.model.numbers.weights)

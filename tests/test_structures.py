@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jnp
-from orthaug.data.record import Record
-from orthaug.fitting.elimination import Elimination, eliminate
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import (
+from orthaug import (
     Additive,
+    Baseline,
     BaselinePenalty,
+    Function,
+    InputError,
+    LevenbergMarquardt,
     Orthogonal,
     OrthogonalPenalty,
-    PenaltyRows,
-    Structure,
+    Record,
+    Term,
+    estimate,
 )
-from orthaug.models.learners import Function
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.fitting.elimination import Elimination, eliminate
+from orthaug.fitting.structures import PenaltyRows, Structure
 
 ALL = (Orthogonal(), Additive(), OrthogonalPenalty(0.3), BaselinePenalty(0.3))
 NAMES, INITIAL = ("a", "b", "c"), np.array([0.5, -2.0, 4.0])

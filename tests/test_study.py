@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.studies import study as study_module
 from orthaug.studies.study import Study, as_table, run, runs
 

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug import InputError, Parameter, design_input, read_record
 from orthaug._base import memory
-from orthaug._base.errors import InputError
-from orthaug.analysis.design import design_input
-from orthaug.data.readers import read_record
 from orthaug.fitting.rules import check_cost
-from orthaug.physics.baseline import Parameter
 from orthaug.physics.problem import pose
 
 WRONG = (

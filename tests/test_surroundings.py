@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from test_cli import SPEC, make_project, one_line, run
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug._base.jax import ChecksummedCache
 from orthaug.commands import streams
 from orthaug.commands.folder import check_figure, check_folder

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug.data.record import Record
-from orthaug.studies.synthetic import MassSpringDamper, mass_spring_damper, static
+from orthaug import InputError, Record, synthetic
 
 
 def signals(record: Record) -> tuple[np.ndarray, np.ndarray]:
@@ -22,7 +20,7 @@ def polynomial(u: float) -> float:
 
 @pytest.fixture(scope="module")
 def example():
-    return mass_spring_damper()
+    return synthetic.mass_spring_damper()
 
 
 @pytest.mark.parametrize("noise", [False, True])
@@ -36,7 +34,7 @@ def test_static_example(data_set, noise):
         u = [v - 0.01 for v in u]
     u_test = [0.3 * rng.randn() for _ in range(1024)]
     e = [rng.normal(0.0, 0.009) if noise else 0.0 for _ in u]
-    example = static(data_set, noise=noise)
+    example = synthetic.static(data_set, noise=noise)
     np.testing.assert_array_equal(signals(example.train)[0], u)
     np.testing.assert_allclose(
         signals(example.train)[1], [polynomial(a) + b for a, b in zip(u, e, strict=True)]
@@ -46,7 +44,7 @@ def test_static_example(data_set, noise):
 
 
 def test_static_example_baseline():
-    example = static()
+    example = synthetic.static()
     assert example.baseline.names == ("theta1", "theta3")
     assert [term.regressor for term in example.baseline.terms] == ["u[k]", "u[k]**3"]
     np.testing.assert_array_equal(example.baseline.initial, [0.8, 0.03])
@@ -55,13 +53,13 @@ def test_static_example_baseline():
 
 @pytest.mark.parametrize("data_set", [1, 2, 3])
 def test_static_example_of_another_length(data_set):
-    example = static(data_set, samples=100)
+    example = synthetic.static(data_set, samples=100)
     assert (len(example.train), len(example.test)) == (100, 1024)
 
 
 def test_static_example_has_three_sets():
     with pytest.raises(InputError, match="`data_set` must be 1, 2 or 3; got 4"):
-        static(4)
+        synthetic.static(4)
 
 
 def step(theta, y1, y2, force):
@@ -114,7 +112,7 @@ def test_least_squares_on_the_mass_spring_damper(example):
 
 
 def test_friction_is_odd_and_decays_from_static_to_coulomb():
-    friction = MassSpringDamper().friction
+    friction = synthetic.MassSpringDamper().friction
     assert friction(0.0) == 0.0
     np.testing.assert_allclose(
         friction(np.array([1e-9, -1e-9, 10.0, -10.0])), [1.2, -1.2, 0.8, -0.8], rtol=1e-6

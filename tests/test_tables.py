@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import InputError
 from orthaug.data import tables
 from orthaug.data.layouts import layout
 from orthaug.data.tables import check_readable, column_names, has_column, read_table

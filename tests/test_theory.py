@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from test_architecture import ROOMS
+from test_cli import run
 
-from orthaug.commands.cli import app
 from orthaug.studies.reproduction import catalogue
 from orthaug.studies.theory import THEORY, Statement
 
@@ -20,9 +20,7 @@ TESTS = Path(__file__).parent
 PAPER = json.loads((TESTS / "references" / "paper.json").read_text(encoding="utf-8"))
 SOURCE = TESTS.parents[1] / "shared" / "paper" / "orthogonal-by-construction.tex"
 STATEMENTS = ("assum", "cond", "exmp", "lem", "property", "thm")
-COMMANDS = {
-    command.name or getattr(command.callback, "__name__", "") for command in app.registered_commands
-}
+COMMANDS = {*re.findall(r"^  (\w+) ", run("--help").out.partition("Commands:")[2], re.MULTILINE)}
 FUNCTIONS = {
     path.stem: {
         node.name

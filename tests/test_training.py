@@ -5,19 +5,29 @@ from __future__ import annotations
 from functools import cache
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_free_run import FREE, LM, NETWORK, PHYSICS, record
 
-from orthaug._base.jax import jax, jnp
-from orthaug.data.record import Record
-from orthaug.fitting.estimation import estimate
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    BaselinePenalty,
+    EquinoxModule,
+    Function,
+    Orthogonal,
+    OrthogonalPenalty,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.held_out import Ratio, mean_square
 from orthaug.fitting.status import Ending
-from orthaug.fitting.structures import Additive, BaselinePenalty, Orthogonal, OrthogonalPenalty
-from orthaug.models.learners import MLP, Bound, EquinoxModule, Function
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.models.learners import Bound
 
 OPTIONS = {"learner": NETWORK, "criterion": FREE, "solver": LM}
 

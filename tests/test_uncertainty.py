@@ -4,29 +4,37 @@ from __future__ import annotations
 
 from functools import cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug import (
+    MLP,
+    Additive,
+    Baseline,
+    Function,
+    InputError,
+    LevenbergMarquardt,
+    OrthogonalPenalty,
+    Record,
+    Samples,
+    Simulation,
+    Term,
+    Training,
+    Uniform,
+    estimate,
+    orthogonalize,
+    prediction_std,
+    synthetic,
+)
 from orthaug.analysis.robustness import robust_where_asked
-from orthaug.data.record import Record
-from orthaug.fitting.conclusion import orthogonalize
-from orthaug.fitting.criteria import Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, OrthogonalPenalty
 from orthaug.inference.covariance import (
     interval,
     joint_covariance,
     newey_west,
-    prediction_std,
     robust_split_covariance,
 )
-from orthaug.inference.measures import Samples, Training, Uniform
-from orthaug.models.learners import MLP, Function
-from orthaug.physics.baseline import Baseline, Term
-from orthaug.studies.synthetic import NOISE_30_DB, static
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)
@@ -34,7 +42,7 @@ WIDE = Samples(
     {"u[k]": 0.6 * NODE}, weights=SHARE
 )  # uniform on ±0.6, exact for smooth physics, and quick
 QUICK = LevenbergMarquardt(iterations=12)
-EXAMPLE = static(1)
+EXAMPLE = synthetic.static(1)
 
 
 def powers(weights, z):
@@ -116,14 +124,14 @@ def clean():
 @pytest.fixture(scope="module")
 def noisy():
     """The paper's draw of 30 dB."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(example.train, example.baseline, learner=MLP((6,)), regularization=RIDGE)
 
 
 @cache
 def estimable():
     """The same draw with a learner of which the data determine every weight."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     return estimate(
         example.train, example.baseline, learner=LINEAR, solver=QUICK, regularization="none"
     )
@@ -138,7 +146,8 @@ def draws(count, seed=0):
     (quiet,) = EXAMPLE.train.experiments
     for _ in range(count):
         yield Record.from_arrays(
-            quiet.inputs, quiet.outputs + rng.normal(scale=NOISE_30_DB, size=quiet.outputs.shape)
+            quiet.inputs,
+            quiet.outputs + rng.normal(scale=synthetic.NOISE_30_DB, size=quiet.outputs.shape),
         )
 
 
@@ -349,7 +358,7 @@ def test_one_pass_over_chunks_is_a_sum_over_rows(count):
 
 
 def test_physics_alone_has_its_textbook_as_joint_covariance():
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, learner=None)
     np.testing.assert_allclose(fit.joint_covariance(), fit.covariance, rtol=1e-10)
     factor = 2 * (1024 - 2) / 1024
@@ -361,7 +370,7 @@ def test_what_has_no_joint_covariance(noisy):
         InputError, match="`convention` must be one of calibrated, paper; got 'ljung'"
     ):
         noisy.joint_covariance("ljung")
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     ensemble = estimate(
         example.train,
         example.baseline,
@@ -393,7 +402,7 @@ def test_prediction_std_is_the_delta_method(noisy):
 
 def test_prediction_std_of_an_unregularised_fit_is_that_of_what_the_data_see():
     """Over-parametrised weights: on its own rows a fit of rank r has variance rσ²/N on average."""
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     fit = estimate(example.train, example.baseline, regularization="none")
     (found,) = prediction_std(fit.model, example.train)
     rank = np.mean(found**2) * len(found) / fit.model.statistics.noise[0, 0]
@@ -440,7 +449,7 @@ def test_prediction_intervals_cover_the_truth():
     test = Record.from_arrays(held_out, truth[1])
     inside, start = [], None
     for _ in range(100):
-        record = Record.from_arrays(u, truth[0] + rng.normal(scale=NOISE_30_DB, size=300))
+        record = Record.from_arrays(u, truth[0] + rng.normal(scale=synthetic.NOISE_30_DB, size=300))
         options = {"learner": LINEAR} if start is None else {"initial": start}
         fit = estimate(record, EXAMPLE.baseline, solver=LevenbergMarquardt(8), **options)
         start = start or fit
@@ -596,7 +605,7 @@ def test_newey_west_of_no_lag_is_whites():
 
 @cache
 def other(kind):
-    example = static(1, noise=True)
+    example = synthetic.static(1, noise=True)
     given = {"learner": MLP((6,)), "solver": QUICK}
     if kind == "bound":
         bounded = Baseline.from_terms([Term("theta1", "u[k]", max=0.9), Term("theta3", "u[k]**3")])

@@ -10,15 +10,19 @@ from test_cli import MLP as NETWORK
 from test_cli import SPEC, make_project, one_line, run, signals, write_csv
 from test_parallel import PHYSICS, record_of
 
-from orthaug._base.errors import InputError
-from orthaug.fitting.criteria import Prediction, Simulation
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.rules import tried
-from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.fitting.structures import Additive, Orthogonal
-from orthaug.models.learners import MLP
-from orthaug.models.storage import load
+from orthaug import (
+    MLP,
+    AdamLBFGS,
+    Additive,
+    InputError,
+    LevenbergMarquardt,
+    Orthogonal,
+    Prediction,
+    Simulation,
+    estimate,
+    load,
+)
+from orthaug.fitting.rules import choose_regularizations
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -152,7 +156,10 @@ def test_what_auto_stands_for(change, expected):
         "criterion": Prediction(),
         "structure": Orthogonal(),
     }
-    assert tried(**(usual | {"linear": True, "validated": False} | change)) == expected
+    assert (
+        choose_regularizations(**(usual | {"linear": True, "validated": False} | change))
+        == expected
+    )
 
 
 @pytest.mark.parametrize(

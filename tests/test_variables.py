@@ -12,8 +12,8 @@ import scipy.io
 import scipy.sparse
 from test_cli import run, signals
 
-from orthaug._base.errors import InputError
-from orthaug.data.tables import column_names, has_column
+from orthaug import InputError
+from orthaug.data.tables import column_names, has_column, read_table
 from orthaug.data.variables import read_variables
 
 h5py = pytest.importorskip("h5py")
@@ -161,8 +161,6 @@ def test_datasets_of_hdf5_by_their_path(tmp_path, name):
 @pytest.mark.parametrize("kind", [float, int, bool])
 def test_cells_of_excel(tmp_path, kind):
     path = put_excel(tmp_path / "run.xlsx", u=np.array([1, 0, 1], dtype=kind))
-    from orthaug.data.tables import read_table
-
     found = read_table(path, ("u",)).columns["u"]
     assert found.dtype == np.float64 and found.tolist() == [1.0, 0.0, 1.0]
 

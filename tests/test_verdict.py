@@ -9,7 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthaug._base.errors import InputError
+from orthaug import (
+    MLP,
+    Baseline,
+    InputError,
+    Lags,
+    LevenbergMarquardt,
+    Model,
+    Record,
+    Term,
+    estimate,
+)
 from orthaug.analysis.validation import (
     Extrapolation,
     Trial,
@@ -19,17 +29,11 @@ from orthaug.analysis.validation import (
     extrapolation,
     free_run_error,
     judge,
-    trial_on,
+    score_trial,
 )
-from orthaug.data.record import Record
-from orthaug.data.regressors import Lags, stack_rows
-from orthaug.fitting.estimation import estimate
-from orthaug.fitting.held_out import blocked
-from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.data.regressors import stack_rows
+from orthaug.fitting.held_out import held_out_blocks
 from orthaug.fitting.status import Ending
-from orthaug.models.learners import MLP
-from orthaug.models.model import Model
-from orthaug.physics.baseline import Baseline, Term
 from orthaug.reports.findings import ValidationResult
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -93,7 +97,7 @@ def usable(record, start):
 @pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=short)
 def test_every_row_is_held_out_once_in_contiguous_blocks(lengths, blocks, start):
     record = numbered(lengths)
-    folds = blocked(record, blocks, start)
+    folds = held_out_blocks(record, blocks, start)
     assert len(folds) == blocks
     held = [places(out) for _, out in folds]
     assert [place for block in held for place in block] == places(record)
@@ -104,14 +108,14 @@ def test_every_row_is_held_out_once_in_contiguous_blocks(lengths, blocks, start)
 @pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=short)
 def test_training_rows_keep_the_lag_length_away(lengths, blocks, start):
     """Neither a row nor any of its lags is shared by training and held-out rows."""
-    for training, out in blocked(numbered(lengths), blocks, start):
+    for training, out in held_out_blocks(numbered(lengths), blocks, start):
         nearest = [abs(k - j) for i, k in places(training) for h, j in places(out) if h == i]
         assert min(nearest, default=math.inf) > start
 
 
 @pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES, ids=short)
 def test_training_experiments_are_unbroken(lengths, blocks, start):
-    for training, _ in blocked(numbered(lengths), blocks, start):
+    for training, _ in held_out_blocks(numbered(lengths), blocks, start):
         for experiment in training.experiments:
             assert (np.diff(experiment.outputs[:, 0]) == 1).all() and len(
                 set(experiment.inputs[:, 0])
@@ -122,7 +126,12 @@ def test_training_experiments_are_unbroken(lengths, blocks, start):
 @pytest.mark.parametrize(("lengths", "blocks", "start"), SHAPES + UNEVEN, ids=short)
 def test_all_folds_have_as_many_usable_rows(lengths, blocks, start):
     assert (
-        len({usable(training, start) for training, _ in blocked(numbered(lengths), blocks, start)})
+        len(
+            {
+                usable(training, start)
+                for training, _ in held_out_blocks(numbered(lengths), blocks, start)
+            }
+        )
         == 1
     )
 
@@ -137,7 +146,7 @@ def test_too_few_rows_for_the_blocks(lengths, blocks, start):
     with pytest.raises(
         InputError, match=f"{rows} rows are too few for {blocks} blocks with gaps of {start} rows"
     ):
-        blocked(numbered(lengths), blocks, start)
+        held_out_blocks(numbered(lengths), blocks, start)
 
 
 # --- ranges
@@ -327,17 +336,17 @@ def test_the_error_of_a_free_run_is_that_of_simulate():
     assert free_run_error(model, part, 7, unit=np.array([2.0])) == pytest.approx(
         np.sqrt(np.mean(e**2)) / 2
     )
-    assert trial_on("here", part, (7,), model, model) == Trial(
+    assert score_trial("here", part, (7,), model, model) == Trial(
         "here", *[free_run_error(model, part, 7)] * 2
     )
 
 
 def test_free_runs_that_exist_are_not_run_again(monkeypatch):
     model, part = fitted(system(0, 200)).model, system(1, 100)
-    plain, response = trial_on("here", part, (7,), model, model), model.simulate(part)
+    plain, response = score_trial("here", part, (7,), model, model), model.simulate(part)
     monkeypatch.setattr(Model, "simulate", lambda *_: pytest.fail("run again"))
     assert (
-        trial_on("here", part, (7,), model, model, alone_response=response, response=response)
+        score_trial("here", part, (7,), model, model, alone_response=response, response=response)
         == plain
     )
 
@@ -346,7 +355,7 @@ def test_a_constant_output_is_not_taken_for_a_free_run_that_diverges():
     record = system(0, 200)
     rest = Record.from_arrays(np.zeros(50), np.zeros(50))
     found = judge(
-        [trial_on("tests.rest", rest, (0,), fitted(record).model, fitted(record, **SMALL).model)]
+        [score_trial("tests.rest", rest, (0,), fitted(record).model, fitted(record, **SMALL).model)]
     )
     assert found is None or "diverges" not in found.text
 
@@ -367,7 +376,7 @@ def test_errors_are_those_of_fits_without_the_block():
     record = system(0, 200, nonlinear=True)
     errors = validated(record, 3, **SMALL)
     assert len(errors) == 3
-    training, out = blocked(record, 3, 2)[1]
+    training, out = held_out_blocks(record, 3, 2)[1]
     unit = record.experiments[0].outputs.std(axis=0)
     expected = [free_run_error(fitted(training, **o).model, out, unit=unit) for o in ({}, SMALL)]
     trial = block_trials(errors, 1)[1]
@@ -423,7 +432,7 @@ def test_too_few_rows_are_refused_before_any_fit():
 def test_an_overfitted_learner_hurts_in_extrapolation(seed):
     record, far = system(seed, 60, noise=0.3), system(seed + 10, 200, noise=0.3, scale=3.0)
     fit = fitted(record, **GREEDY)
-    trial = trial_on("tests.far", far, (0,), fitted(record).model, fit.model)
+    trial = score_trial("tests.far", far, (0,), fitted(record).model, fit.model)
     x = rows_of(far, fit.problem.layout)
     found = judge([trial], extrapolation("tests.far", x, fit.problem.rows.x, fit.problem.layout))
     assert trial.model > trial.alone

@@ -1,4 +1,4 @@
-"""Formulas as they stand in the Markdown, `θ̂ = R⁻¹QᵀY` or y_k, typeset as MathML: browsers draw it, without a script.
+"""Formulas as they are in the Markdown, `θ̂ = R⁻¹QᵀY` or y_k, typeset as MathML: browsers draw it, without a script.
 
 The Markdown stays text that is read in the repository. Code that is a formula, lines of formulas, and letters with an
 index in prose are found in the finished page; whatever else is code stays code.

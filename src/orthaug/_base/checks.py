@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.errors import LONGEST, InputError, shown
+from orthaug._base.errors import LONGEST, InputError, show
 
 _COMPARED = 1000  # names that a misspelt one is compared with
 Vector = Float[np.ndarray, "_"]
@@ -68,7 +68,7 @@ def check_label(value: Any, what: str) -> str:
     if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST:
         raise InputError(
             f"{what} must be visible characters on one line, at most {LONGEST} of them; got "
-            f"{shown(value)}."
+            f"{show(value)}."
         )
     return value
 
@@ -77,7 +77,7 @@ def check_choice(value: str, choices: Iterable[str], what: str) -> str:
     """Return `value` if it is one of `choices`, otherwise raise InputError naming them."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
-        raise InputError(f"{what} must be one of {', '.join(choices)}; got {shown(value)}.")
+        raise InputError(f"{what} must be one of {', '.join(choices)}; got {show(value)}.")
     return value
 
 
@@ -98,7 +98,7 @@ def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         counted = f" of {of}" if of else ""
         raise InputError(
-            f"`{name}` must be a whole number{counted}, {least} or more; got {shown(value)}."
+            f"`{name}` must be a whole number{counted}, {least} or more; got {show(value)}."
         )
     return int(value)
 
@@ -126,7 +126,7 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
     if not is_number(value) or value < 0 or (positive and value == 0):
         raise InputError(
             f"`{name}` must be {'a positive number' if positive else 'a number, 0 or more'}; "
-            f"got {shown(value)}."
+            f"got {show(value)}."
         )
     return float(value)
 
@@ -134,4 +134,4 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
 def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
     """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
     if isinstance(value, type) or not isinstance(value, kinds):
-        raise InputError(f"`{name}` must be {wanted}; got {shown(value)}.")
+        raise InputError(f"`{name}` must be {wanted}; got {show(value)}.")

@@ -24,21 +24,21 @@ _WORD = re.compile(r"""[^\s/\\'"`]+""")
 def visible(text: str) -> str:
     """Return the text with line breaks, terminal controls and invisible characters escaped."""
     return (
-        text if text.isprintable() else "".join(c if c.isprintable() else _escaped(c) for c in text)
+        text if text.isprintable() else "".join(c if c.isprintable() else _escape(c) for c in text)
     )
 
 
-def shown(value: Any) -> str:
+def show(value: Any) -> str:
     """Return a value as Python writes it, on one line, cut where it is long."""
     try:
         if math.prod(getattr(value, "shape", ())) > _FEW:
             return f"an array of shape {tuple(value.shape)}"
-        return cut(visible(" ".join(repr(value)[:_MOST].split())))
+        return shorten(visible(" ".join(repr(value)[:_MOST].split())))
     except Exception:  # a foreign `__repr__` may do anything, and one of a huge whole number fails
         return f"a {type(value).__name__} that cannot be written"
 
 
-def cut(text: str) -> str:
+def shorten(text: str) -> str:
     """Return at most `LONGEST` characters of a text."""
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
@@ -49,9 +49,9 @@ def message(text: str) -> str:
     Its names, values and paths are visible, and cut where they are long.
     """
     text = visible(_ends(text, _SEARCHED))
-    text = _QUOTED.sub(lambda found: f"{found[1]}{cut(found[2])}{found[1]}", text)
-    text = _LISTED.sub(lambda found: f"[{cut(found[0][1:-1])}]", text)
-    text = _WORD.sub(lambda found: cut(found[0]), text)
+    text = _QUOTED.sub(lambda found: f"{found[1]}{shorten(found[2])}{found[1]}", text)
+    text = _LISTED.sub(lambda found: f"[{shorten(found[0][1:-1])}]", text)
+    text = _WORD.sub(lambda found: shorten(found[0]), text)
     return _ends(text, _MOST)
 
 
@@ -61,7 +61,7 @@ def _ends(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:head]} … {text[head - most :]}"
 
 
-def _escaped(character: str) -> str:
+def _escape(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 

@@ -54,14 +54,14 @@ class Partials:
     def folder(self, parent: Path, made: Sequence[Path] = ()) -> Path:
         """Return a new folder in `parent`; `made` are the parents that vanish with it."""
         with self.lock:
-            partial = self._named(parent, made)
+            partial = self._name_file(parent, made)
             partial.mkdir()
             return partial
 
     def file(self, parent: Path) -> Path:
         """Return a new empty file in `parent`."""
         with self.lock:
-            partial = self._named(parent, ())
+            partial = self._name_file(parent, ())
             partial.touch(exist_ok=False)
             return partial
 
@@ -102,7 +102,7 @@ class Partials:
         for partial in list(self._open):
             self.discard(partial)
 
-    def _named(self, parent: Path, made: Sequence[Path]) -> Path:
+    def _name_file(self, parent: Path, made: Sequence[Path]) -> Path:
         if parent not in self._swept:
             remove_stale(parent, self._open)
             self._swept.add(parent)
@@ -297,13 +297,16 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
 
 @contextmanager
 def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Iterator[Path]:
-    """A file beside `path` that takes its place at the end, and vanishes on any exception.
+    """Yield a file beside `path` that replaces it at the end, and vanishes on any exception.
 
     A link is followed: its target is written. What is no regular file, such as a pipe, is written
     into.
 
-    Args: force: replace whatever is there. result: whether a command that a signal ends names the
-        file among what it wrote; False for a cache.
+    Args:
+        path: the file to write.
+        force: replace whatever is there.
+        result: whether a command that a signal ends names the file among what it wrote; False for a
+            cache.
 
     Raises:
         InputError: the file cannot be written, or exists already and holds something else.
@@ -374,7 +377,7 @@ def not_ours(folder: Path) -> str | None:
     Without a manifest nothing says who wrote a file, whatever its name: each counts as the user's
     own.
     """
-    listed = _listed(folder / MANIFEST)
+    listed = _listed_checksums(folder / MANIFEST)
     if listed is None:
         name = next(_names(folder), None)
         return None if name is None else f"{name} and no {MANIFEST} that says orthaug wrote it"
@@ -406,7 +409,7 @@ def file_digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _listed(path: Path) -> dict[str, str] | None:
+def _listed_checksums(path: Path) -> dict[str, str] | None:
     """Return the checksums of a manifest; None where there is none of orthaug's."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))

@@ -222,11 +222,11 @@ def _check_cached_programs() -> None:
         return
 
     @functools.wraps(make)
-    def checked(path: str) -> Any:
+    def check_one(path: str) -> Any:
         try:
             made = make(path)
         except Exception:  # a place that cannot be written
             return None
         return made and (ChecksummedCache(made[0], path), made[1])
 
-    compilation_cache.get_file_cache = checked
+    compilation_cache.get_file_cache = check_one

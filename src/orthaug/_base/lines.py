@@ -22,7 +22,7 @@ def fit_screen(columns: int) -> None:
     _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
-def counted(number: int, thing: str) -> str:
+def plural(number: int, thing: str) -> str:
     """Return `1 sample`, `2 samples`."""
     return f"{number} {thing}" + ("" if number == 1 else "s")
 
@@ -116,12 +116,10 @@ def fold(lines: Iterable[str], width: int | None = None) -> list[str]:
     """
     most = width or _screen[0]
     single = (one for line in lines for one in line.split("\n"))
-    return [
-        part for line in single for part in (_folded(line, most) if len(line) > most else [line])
-    ]
+    return [part for line in single for part in (_fold(line, most) if len(line) > most else [line])]
 
 
-def _folded(line: str, width: int) -> list[str]:
+def _fold(line: str, width: int) -> list[str]:
     cell = _LAST_CELL.match(line)
     indent = cell.end() if cell and cell.end() <= _LATEST else 0 if cell else 2
     if cell and not indent:  # a table of numbers: it cannot be broken

@@ -15,7 +15,7 @@ _ARENA_MAX = -8  # glibc's name for the number of arenas
 
 def available() -> float:
     """Return the bytes that this process may still take; infinite where they are not known."""
-    return min(_unused(), _allowed())
+    return min(_free_bytes(), _limit_bytes())
 
 
 def limit() -> float:
@@ -36,7 +36,7 @@ def check_limit(size: float, what: str) -> None:
 
     The system would end the process without a message.
     """
-    there = _allowed()
+    there = _limit_bytes()
     if size > there:
         raise InputError(
             f"{what} takes {in_words(size)} of memory; the limit (ulimit -v) leaves "
@@ -71,7 +71,7 @@ def in_words(size: float) -> str:
     return f"{size / 1024**step:.3g} {('bytes', 'KiB', 'MiB', 'GiB', 'TiB', 'PiB')[step]}"
 
 
-def _unused() -> float:
+def _free_bytes() -> float:
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             lines = dict(line.split(":", 1) for line in file)
@@ -83,7 +83,7 @@ def _unused() -> float:
             return math.inf
 
 
-def _allowed() -> float:
+def _limit_bytes() -> float:
     """Return the bytes that limits on the process (`ulimit -v`) leave."""
     most = limit()
     if math.isinf(most):

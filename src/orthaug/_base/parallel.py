@@ -70,7 +70,7 @@ class RunCancelled(Exception):
     """Another run failed, or the user pressed Ctrl-C: this run's result is no longer wanted."""
 
 
-def spread(
+def run_all(
     function: Callable[[Item, Callable[[], None]], Result],
     items: Sequence[Item],
     workers: int | None = None,
@@ -79,10 +79,10 @@ def spread(
 
     Arguments are those of `each`.
     """
-    return list(each(function, items, workers))
+    return list(iterate_results(function, items, workers))
 
 
-def each(
+def iterate_results(
     function: Callable[[Item, Callable[[], None]], Result],
     items: Sequence[Item],
     workers: int | None = None,
@@ -139,10 +139,11 @@ class Threads:
     ) -> Iterator[Result]:
         """Yield `function(given, item, report)` of every item in order.
 
-        Args: function: of a module, so that it can be sent elsewhere. It calls `report(…)` now and
-            then, which raises
-                `RunCancelled` once the results are not wanted.
+        Args:
+            function: of a module, so that it can be sent elsewhere. It calls `report(…)` now and
+                then, which raises `RunCancelled` once the results are not wanted.
             given: what all runs share.
+            items: one for each run.
             heard: called with the number of an item and the reports of its run.
         """
 
@@ -155,7 +156,7 @@ class Threads:
 
             return function(given, item, report)
 
-        return each(one, list(enumerate(items)))
+        return iterate_results(one, list(enumerate(items)))
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:

@@ -38,11 +38,11 @@ def quiet(iteration: int, loss: float) -> None:
     """Ignore the progress of a run."""
 
 
-def _unplanned(first: int, plan: Plan) -> None:
+def _ignore_plan(first: int, plan: Plan) -> None:
     """Ignore the plan of the runs."""
 
 
-def _nothing(run: int, iteration: int, loss: float) -> None:
+def _ignore_progress(run: int, iteration: int, loss: float) -> None:
     """Ignore the progress of all runs."""
 
 
@@ -60,10 +60,10 @@ class Progress:
         2 20 0.5
     """
 
-    report: ProgressCallback = _nothing
+    report: ProgressCallback = _ignore_progress
     runs: int = 0
     iterations: int = 0
-    plan: Callable[[int, Plan], None] = _unplanned
+    plan: Callable[[int, Plan], None] = _ignore_plan
     """Called with the number of the first run of a fit, and with its plan."""
 
     def __call__(self, run: int, iteration: int, loss: float) -> None:

@@ -154,7 +154,7 @@ class Registry(Mapping[str, Any]):
         del self._entries[kind]
 
     @contextmanager
-    def added(self, kind: str, declaration: type) -> Iterator[None]:
+    def with_kind(self, kind: str, declaration: type) -> Iterator[None]:
         """Register a declaration inside a `with` block only."""
         self.add(kind, declaration)
         try:
@@ -207,7 +207,7 @@ class Registry(Mapping[str, Any]):
                     f" is missing; {kind} needs it",
                 )
         return self._entries[kind](
-            **{name: frozen(value) for name, value in values.items() if name in known}
+            **{name: freeze(value) for name, value in values.items() if name in known}
         )
 
 
@@ -251,10 +251,10 @@ def _default(field: dataclasses.Field[Any]) -> Any:
     return field.default
 
 
-def frozen(value: Any) -> Any:
+def freeze(value: Any) -> Any:
     """Return lists, as files hold them, as tuples."""
     if isinstance(value, list | tuple):
-        return tuple(frozen(item) for item in value)
+        return tuple(freeze(item) for item in value)
     if isinstance(value, Mapping):
-        return {name: frozen(item) for name, item in value.items()}
+        return {name: freeze(item) for name, item in value.items()}
     return value.item() if isinstance(value, np.generic) else value

@@ -61,7 +61,7 @@ def with_progress(verb: Callable[Arguments, Result]) -> Callable[Arguments, Resu
     """
 
     @wraps(verb)
-    def shown(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+    def with_shown_progress(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
         wanted = options.get("progress")
         if not isinstance(wanted, bool):
             return verb(*arguments, **options)
@@ -73,4 +73,4 @@ def with_progress(verb: Callable[Arguments, Result]) -> Callable[Arguments, Resu
             options["progress"] = report
             return verb(*arguments, **options)
 
-    return shown
+    return with_shown_progress

@@ -145,7 +145,7 @@ class Smoother:
         return known[KDTree(self.inputs).query(self._z(x))[1]]
 
 
-def absorbed(
+def term_effects(
     problem: Problem,
     terms: Iterable[Callable[[Matrix], Matrix]],
     seen: Iterable[bool],
@@ -174,7 +174,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
     phi = np.asarray(problem.baseline.phi(rows, problem.layout, problem.outputs, np))
     delta, gain = term(rows), problem.weight.matrix
     left, target = smoother.left(times(gain, phi)), smoother.left(times(gain, delta))
-    others = completing(problem.shared.basis)
+    others = complementary_parameters(problem.shared.basis)
     moved = np.zeros(len(problem.baseline.names))
     if others:
         columns = left[..., others].reshape(-1, len(others))
@@ -184,7 +184,7 @@ def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> 
     return TermAfterFit(moved, smoother.mean(delta - phi @ moved, x), False)
 
 
-def completing(basis: Matrix) -> list[int]:
+def complementary_parameters(basis: Matrix) -> list[int]:
     """Return the parameters whose directions complete the shared ones."""
     if not basis.shape[1]:
         return list(range(len(basis)))
@@ -202,13 +202,13 @@ class Waves:
         return jnp.zeros((ny, 1 + nz + WAVES))
 
     def apply(self, tree: Any, z: Any) -> Any:
-        slopes, offsets = _drawn(len(z))
+        slopes, offsets = _draw_waves(len(z))
         waves = jnp.tanh(jnp.tensordot(slopes, z, 1) - offsets.reshape(-1, *(1,) * (z.ndim - 1)))
         return tree @ jnp.concatenate([jnp.ones((1, *z.shape[1:])), z, waves])
 
 
 @lru_cache(maxsize=16)
-def _drawn(nz: int) -> tuple[Matrix, Vector]:
+def _draw_waves(nz: int) -> tuple[Matrix, Vector]:
     """Return slopes (WAVES, nz) and offsets; every wave has its centre among the features."""
     rng = np.random.default_rng(_SEED)
     slopes, centres = _slopes(rng, WAVES, nz), rng.uniform(-1, 1, size=(WAVES, nz))

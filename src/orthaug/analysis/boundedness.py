@@ -54,13 +54,13 @@ def divergence_scaling(
         return None
     rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
     first = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
-    diverges = partial(_diverging, model, first)
-    growing = _doubled(float(largest))
+    diverges = partial(_find_diverging, model, first)
+    growing = _doubling_factors(float(largest))
     wild = diverges(growing)
     if not wild.any():
         return None
     high = int(np.argmax(wild))
-    return _bisected(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
+    return _bisect(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
 
 
 def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
@@ -89,7 +89,7 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
     return text, "small_margin" if factor is not None and factor < _MARGIN else ""
 
 
-def _doubled(largest: float) -> list[float]:
+def _doubling_factors(largest: float) -> list[float]:
     """Return the factors 1, 2, 4, …, `largest`."""
     factors = [1.0]
     while factors[-1] < largest:
@@ -110,10 +110,10 @@ def _below_one(diverges: Diverging) -> float:
     if all(wild):
         return 0.0 if at_rest else falling[-1]
     low = wild.index(False) + 1
-    return _bisected(falling[low], falling[low - 1], diverges)
+    return _bisect(falling[low], falling[low - 1], diverges)
 
 
-def _bisected(low: float, high: float, diverges: Diverging) -> float:
+def _bisect(low: float, high: float, diverges: Diverging) -> float:
     """Return the lowest factor that is known to diverge once `low` and `high` are close.
 
     Every middle is tried at once.
@@ -143,7 +143,7 @@ def _middle(low: float, high: float) -> float:
     return float(np.sqrt(low * high))
 
 
-def _diverging(
+def _find_diverging(
     model: Model | MotionModel, record: Record, factors: Sequence[float]
 ) -> Bool[np.ndarray, "f"]:
     """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
@@ -200,7 +200,7 @@ def _side_by_side(
     """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
-    def going_on(carry: tuple[Any, Any, Any]) -> Any:
+    def is_unfinished(carry: tuple[Any, Any, Any]) -> Any:
         return (carry[0] < steps) & ~carry[2].all()
 
     def step(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
@@ -209,4 +209,6 @@ def _side_by_side(
         return k + 1, states, wild | ~(jnp.abs(parts.total) <= bound).all(axis=1)
 
     states = jnp.broadcast_to(state, (len(factors), *state.shape))
-    return jax.lax.while_loop(going_on, step, (0, states, jnp.zeros(len(factors), dtype=bool)))[2]
+    return jax.lax.while_loop(
+        is_unfinished, step, (0, states, jnp.zeros(len(factors), dtype=bool))
+    )[2]

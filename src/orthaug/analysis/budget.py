@@ -40,7 +40,7 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.inference.measures import Measure, Symmetrized, Training, Uniform, weigh_problem
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.shared import seen, shared_directions
+from orthaug.physics.shared import seen_columns, shared_directions
 
 if TYPE_CHECKING:
     from orthaug.analysis.motion_bias import TermBias
@@ -74,13 +74,15 @@ def _by_inputs(
         features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
         if not set(features.lags) <= set(layout):
             continue
-        if not seen(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[0]:
+        if not seen_columns(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[
+            0
+        ]:
             continue
         shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
         if shared.all:
             continue
         left = _bias(replace(linearization, directions=shared.basis), suspect)
-        freed = _freed(linearization, cause, left, biased)
+        freed = _freed_parameters(linearization, cause, left, biased)
         if len(freed) > len(best[1]):
             best = (inputs, freed)
     if best[1]:
@@ -105,7 +107,7 @@ def _by_measure(
             left = _bias(other, cause.suspect)
         except InputError:
             continue
-        if len(_freed(linearization, cause, left, biased)) == len(biased):
+        if len(_freed_parameters(linearization, cause, left, biased)) == len(biased):
             yield f"split under the {measure.name} measure"
             return
 
@@ -120,7 +122,7 @@ def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
     )
 
 
-def _freed(
+def _freed_parameters(
     linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
@@ -241,16 +243,17 @@ def budget_on(
         return None
     causes, moved = (
         tuple(cause for _, cause in found),
-        np.array([_moved(cause) for _, cause in found]),
+        np.array([_theta_shift(cause) for _, cause in found]),
     )
     bias, rest = (
         moved.sum(axis=0),
         [row for own, cause in found for row in left_over(own, cause, suspects)],
     )
-    rest = np.array([*rest, *map(_moved, nameless)])
+    rest = np.array([*rest, *map(_theta_shift, nameless)])
     candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
     std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    other = _norm([_moved(cause) for cause in nameless])
+    shifts = [_theta_shift(cause) for cause in nameless]
+    other = np.linalg.norm(np.array(shifts), axis=0) if shifts else 0.0
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
     names = linearization.problem.baseline.names
     parameters = parameter_biases(
@@ -269,10 +272,6 @@ def budget_on(
         own, cause = found[0]
         raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
     return Budget(causes, parameters, rows, (*raised, *warnings))
-
-
-def _norm(rows: Sequence[Vector]) -> Vector | float:
-    return np.linalg.norm(np.array(rows), axis=0) if len(rows) else 0.0
 
 
 def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
@@ -312,15 +311,20 @@ def _candidates(
         NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
     ]
     for own, cause in found:
-        others = (*_declared(own, suspects), *_usual(own), *_families(own))
+        others = (*_declared_causes(own, suspects), *_usual(own), *_families(own))
         others += own.table(
             saturations([entry.suspect for entry in others]), certify=False, every=False
         )
         likely = [
-            Candidate(entry.suspect.name, explains(entry), _moved(entry) + bias - _moved(cause),
-                      entry.suspect in suspects)
+            Candidate(
+                entry.suspect.name,
+                explains(entry),
+                _theta_shift(entry) + bias - _theta_shift(cause),
+                entry.suspect in suspects,
+            )
             for entry in others
-            if entry.explained and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
+            if entry.explained
+            and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
         ]  # fmt: skip
         kept += compatible(likely, noise_share(own, fit))
     return kept
@@ -371,7 +375,7 @@ def _physical_rows(
     )  # NaN where one has none
     owners = _owners(causes, moved @ turned.T) if slopes else []
     rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
-    return rows, _unbounded(physical.names, own, ends)
+    return rows, _unbounded_warnings(physical.names, own, ends)
 
 
 def _causes(
@@ -398,7 +402,7 @@ def _causes(
         own = replace(
             linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i]
         )
-        cause = named_cause(own, suspects) or _likeliest(own, suspects)
+        cause = named_cause(own, suspects) or _most_likely_suspect(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
@@ -428,7 +432,7 @@ def named_cause(
     Undeclared terms count only if the learner sees them: others are no likely cause.
     """
     for table, families in (
-        (_declared(linearization, suspects), ()),
+        (_declared_causes(linearization, suspects), ()),
         (_usual(linearization), _families(linearization)),
     ):
         best, other = (
@@ -442,11 +446,11 @@ def named_cause(
     return None
 
 
-def _likeliest(
+def _most_likely_suspect(
     linearization: MeasureLinearization, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
     """Return the suspect that explains most of the learner, however little, declared or not."""
-    found = (*_declared(linearization, suspects), *_usual(linearization))
+    found = (*_declared_causes(linearization, suspects), *_usual(linearization))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
@@ -455,7 +459,7 @@ def explains(entry: SuspectedBias | TermBias) -> float:
     return entry.explained or 0.0
 
 
-def _declared(
+def _declared_causes(
     linearization: MeasureLinearization, suspects: Sequence[Suspect]
 ) -> tuple[SuspectedBias, ...]:
     return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
@@ -498,15 +502,15 @@ def rival_of(
         saturations([entry.suspect for entry in usual]), certify=False, every=False
     )
     equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
-    to_coordinates, own = linearization.weighed.projection.to_coordinates, _moved(cause)
+    to_coordinates, own = linearization.weighed.projection.to_coordinates, _theta_shift(cause)
 
-    def apart(entry: SuspectedBias) -> float:
-        return float(np.linalg.norm(to_coordinates @ (_moved(entry) - own)))
+    def separation(entry: SuspectedBias) -> float:
+        return float(np.linalg.norm(to_coordinates @ (_theta_shift(entry) - own)))
 
-    farthest = max(equal, key=apart, default=None)
+    farthest = max(equal, key=separation, default=None)
     return (
         farthest
-        if farthest and apart(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own)
+        if farthest and separation(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own)
         else None
     )
 
@@ -541,14 +545,14 @@ def left_over(
     unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
     """
     assert cause.explained
-    after = _likeliest(
+    after = _most_likely_suspect(
         linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect]
     )
-    rows = [_moved(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
-    return np.array([*rows, *([] if after is None else [_moved(after)])])
+    rows = [_theta_shift(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
+    return np.array([*rows, *([] if after is None else [_theta_shift(after)])])
 
 
-def _moved(cause: SuspectedBias) -> Vector:
+def _theta_shift(cause: SuspectedBias) -> Vector:
     """Return θ moved by a cause of the size found."""
     return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
@@ -589,7 +593,7 @@ def parameter_biases(
     return tuple(found)
 
 
-def _unbounded(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
+def _unbounded_warnings(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
     """Return a warning where physical parameters have an interval but no bounded bias."""
     none = [
         name

@@ -51,9 +51,11 @@ def bias_budget(
         >>> import numpy as np
         >>> import orthaug as oa
         >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
         >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
-        >>> fit = oa.estimate(record, gain, learner=oa.Terms(("u[k]**3",)), structure=oa.Orthogonal(shared="all"))
+        >>> cubic, structure = oa.Terms(("u[k]**3",)), oa.Orthogonal(shared="all")
+        >>> fit = oa.estimate(record, gain, learner=cubic, structure=structure)
         >>> budget = bias_budget(fit, [oa.Suspect("cubic", "u[k]**3")])
         >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
         ('cubic', 0.6)

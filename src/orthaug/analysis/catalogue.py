@@ -47,7 +47,7 @@ FAMILIES = (
 )
 
 
-def members_on(on: str, values: Vector) -> Iterator[tuple[str, str]]:
+def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
     """Yield name and expression of every member of every family for an expression `on`."""
     size = np.abs(values[np.isfinite(values)])
     if not np.any(size > 0):
@@ -70,7 +70,7 @@ def catalogue(problem: Problem) -> tuple[Suspect, ...]:
             values = Suspect(on, on, constants=constants).form(problem.rows.x, problem.layout)
         except InputError:
             continue
-        for name, text in members_on(on, values):
+        for name, text in family_members(on, values):
             found += [
                 Suspect(
                     name if len(problem.outputs) == 1 else f"{name} in {output}",
@@ -102,6 +102,6 @@ def motion_catalogue(
             where = f" in {equation}" if len(places) > 1 else ""
             found += [
                 MotionSuspect(f"{name}{where}", text, equation)
-                for name, text in members_on(on, values)
+                for name, text in family_members(on, values)
             ]
     return tuple(found)

@@ -27,7 +27,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_matrix
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.response import Response, Trajectory
-from orthaug.physics.shared import seen
+from orthaug.physics.shared import seen_columns
 
 WORTH = 0.05  # of the error's variance: what explains less is no change worth making
 _INPUTS_FURTHER, _OUTPUTS_FURTHER = 10, 4  # lags beyond the largest of the model that are tried
@@ -59,10 +59,11 @@ class Change:
     def name(self) -> str:
         """The change, to go on from "with"."""
         where = f" of {self.output}" if self.output else ""
+        place = f"in the physics{where} (or the learner)"
         return {
             "criterion": f'focus = "{self.what}"',
-            "input_lag": f"the further input lag {self.what} in the physics{where} (or the learner)",
-            "output_lag": f"the further output lag {self.what} in the physics{where} (or the learner)",
+            "input_lag": f"the further input lag {self.what} {place}",
+            "output_lag": f"the further output lag {self.what} {place}",
             "offset": f"an offset in the physics{where}",
             "learner": self.what,
         }[self.kind]
@@ -246,10 +247,10 @@ class Candidates:
             piece = Experiment(piece.inputs, ran)
         columns = self._columns(piece, record)
         if self.measured:
-            carried = self._carried(np.concatenate([columns, error], axis=2), piece, record)
+            carried = self._carry_through(np.concatenate([columns, error], axis=2), piece, record)
             columns, error = carried[:, :, :-1], carried[:, :, -1:]
         elif self.simulates:
-            columns = self._carried(columns, piece, record)
+            columns = self._carry_through(columns, piece, record)
         error, scaled = (
             error[skip:, :, 0] / problem.deviation,
             columns[skip:] / problem.deviation[:, None],
@@ -288,7 +289,7 @@ class Candidates:
         }
         return np.array([means[lag.channel] for lag in self.lags])
 
-    def _carried(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
+    def _carry_through(self, columns: np.ndarray, piece: Experiment, record: Record) -> np.ndarray:
         """Return the columns carried through the free run, from a start independent of them."""
         form, first, ny = self.fit.model.form, self.first, columns.shape[1]
         states = form.start(piece.outputs, np.arange(first, len(piece)))
@@ -350,7 +351,7 @@ class Candidates:
         model, problem = self.fit.model, self.fit.problem
         if model.form.bound is None:
             return "a learner"
-        visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+        visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
         return (
             f"a learner that also sees {', '.join(hidden)}"

@@ -113,7 +113,7 @@ def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float,
     enough.
     """
     usual = _usual(own, target)
-    own, others, target = _scaled(own[usual]), _scaled(others[usual]), target[usual]
+    own, others, target = _scale(own[usual]), _scale(others[usual]), target[usual]
     if len(target) < _ROWS_PER_COLUMN * (own.shape[1] + others.shape[1] + 1) or not np.ptp(target):
         return None
     base = np.column_stack([np.ones(len(target)), own])
@@ -138,7 +138,7 @@ def _usual(own: Matrix, target: Vector) -> np.ndarray:
     Jumps of a reference would hide everything between them.
     """
     base, kept = (
-        np.column_stack([np.ones(len(target)), _scaled(own)]),
+        np.column_stack([np.ones(len(target)), _scale(own)]),
         np.ones(len(target), dtype=bool),
     )
     for _ in range(_ROUNDS):
@@ -226,6 +226,6 @@ def _period(x: Vector, beyond: int) -> int | None:
     return int(peaks[np.argmax(r[peaks])]) if len(peaks) else None
 
 
-def _scaled(x: Matrix) -> Matrix:
+def _scale(x: Matrix) -> Matrix:
     size = x.std(axis=0)
     return (x - x.mean(axis=0)) / np.where(size > 0, size, 1.0)

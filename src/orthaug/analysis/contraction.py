@@ -14,8 +14,8 @@ from scipy import linalg
 
 from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.parallel import one_blas_thread
-from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearised
-from orthaug.analysis.visited import RunPoint, evenly
+from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearise_points
+from orthaug.analysis.visited import RunPoint, even_indices
 from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.response import Response
@@ -80,8 +80,10 @@ def contraction(
         return None
     unit, most = run.unit, min(_SAMPLES, int(MOST_WORK / len(run.unit) ** 3))
     steepest = np.argsort(-run.radius, kind="stable")[: min(_STEEPEST, most // 2)]
-    some = run.points.take(np.union1d(evenly(len(run.radius), most - len(steepest)), steepest))
-    points, transition, radius = linearised(model, some.with_box(run.points, box))
+    some = run.points.take(
+        np.union1d(even_indices(len(run.radius), most - len(steepest)), steepest)
+    )
+    points, transition, radius = linearise_points(model, some.with_box(run.points, box))
     a = transition * unit / unit[:, None]
     sizes, metric = _sizes(t := _best_metric(a), a), (t / unit).T @ (t / unit)
     rate, worst = points.worst(record, sizes, model.form.describe)
@@ -120,7 +122,7 @@ def _best_metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
 
 def _metric(a: Float[np.ndarray, "m n n"]) -> Matrix:
     """Return T (n, n) with a small largest `‖T A T⁻¹‖₂`, close to the least."""
-    n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), evenly(len(a), _ACTIVE)
+    n, bound, active = a.shape[1], np.abs(np.linalg.eigvals(a)).max(), even_indices(len(a), _ACTIVE)
     best = t = min([np.eye(n), *_lyapunov(a.mean(axis=0))], key=lambda t: _sizes(t, a).max())
     sizes, least = _sizes(t, a), max(_sizes(t, a).max(), 1e-9)
     for sharpness in (4, 8, 16, 32) if 1 < n <= _LARGEST_SEARCH else ():

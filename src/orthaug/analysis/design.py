@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_number, is_number
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.memory import check_memory
 from orthaug.analysis.plant import Plant
 from orthaug.analysis.suspects import Suspect
@@ -99,7 +99,7 @@ def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]
     """Return named signals of amplitude 1, and the periods of the square waves among them."""
     from orthaug.analysis import signals  # scipy.signal is slow to import
 
-    def spaced(first: int, last: int) -> list[int]:
+    def space_evenly(first: int, last: int) -> list[int]:
         return sorted(
             {
                 *range(first, min(last, 8) + 1),
@@ -107,10 +107,10 @@ def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]
             }
         )
 
-    squares = {f"square, period {2 * half}": 2 * half for half in spaced(1, samples // 8)}
+    squares = {f"square, period {2 * half}": 2 * half for half in space_evenly(1, samples // 8)}
     waves = {"white Gaussian": signals.white_gaussian(samples, amplitude=1, seed=seed)}
     waves["white uniform"] = signals.white_uniform(samples, amplitude=1, seed=seed)
-    for h in spaced(1, max(samples // 64, 1))[::2]:
+    for h in space_evenly(1, max(samples // 64, 1))[::2]:
         waves[f"white binary, hold {h}"] = signals.white_binary(
             samples, amplitude=1, seed=seed, hold=h
         )
@@ -274,7 +274,7 @@ def design_input(
     samples = check_samples(samples, plant)
     set_known(plant, known_inputs, samples)
     plant.before = _numbers(initial_outputs, (plant.start, len(outputs)), "initial_outputs")
-    return searched(
+    return search_input(
         plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations)
     )
 
@@ -306,12 +306,12 @@ def check_samples(samples: Any, plant: DesignPlant) -> int:
     nt, ny = len(plant.theta), len(plant.outputs)
     samples = check_count(samples, "samples", plant.start + 4 * nt + 16)
     if samples > MOST_SAMPLES:
-        raise InputError(f"`samples` is {shown(samples)}; at most {MOST_SAMPLES} are simulated.")
+        raise InputError(f"`samples` is {show(samples)}; at most {MOST_SAMPLES} are simulated.")
     check_memory(8.0 * samples * (_SIGNALS + 4 * ny * (nt + 2)), f"a design of {samples} samples")
     return samples
 
 
-def searched(
+def search_input(
     plant: DesignPlant,
     limits: tuple[tuple[float, float], float | None, float],
     sampling_time: float,
@@ -376,7 +376,7 @@ def input_limits(amplitude: Any, minimum: Any, maximum: Any) -> tuple[float, flo
 def _limit(name: str, value: Any) -> float:
     if not is_number(value) or abs(value) > LARGEST:
         raise InputError(
-            f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {shown(value)}."
+            f"`{name}` must be a number between {-LARGEST:g} and {LARGEST:g}; got {show(value)}."
         )
     return float(value)
 
@@ -438,7 +438,7 @@ class _Search:
 
     def run(self, seed: int, iterations: int) -> Design:
         named, squares = families(self.samples, seed)
-        u, factors = self.measured(np.stack(list(named.values()), axis=1))
+        u, factors = self.measure(np.stack(list(named.values()), axis=1))
         if not factors.any():
             raise InputError(
                 "the simulated output runs away under every input; give a `theta` that is stable."
@@ -447,7 +447,7 @@ class _Search:
         patterns = self.patterns(
             squares[min(squares, key=lambda name: rank[name])], seed, iterations
         )
-        more, theirs = self.measured(
+        more, theirs = self.measure(
             np.stack([pattern(self.samples) for pattern in patterns], axis=1)
         )
         u, scores = np.hstack([u, more]), self.scores(np.concatenate([factors, theirs]))
@@ -466,14 +466,14 @@ class _Search:
         own = u[:, k].copy(), name, self.plant.names, scores.bias[k], scores.std[k]
         return Design(*own, math.sqrt(cost), condition, cost, table)
 
-    def measured(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
+    def measure(self, waves: Matrix, period: Vector | None = None) -> tuple[Matrix, Factors]:
         """Return the limited signals (N, M) of waves of amplitude 1, and their factors per row.
 
         Factors are those of whole periods if given.
         """
         signals, factors, size = [], [], max(1, BATCH // len(waves))
         for first in range(0, waves.shape[1], size):
-            u = self.limited(waves[:, first : first + size])
+            u = self.limit(waves[:, first : first + size])
             rows, weight = self.plant.rows(u)
             counted = np.full(len(rows), rows.shape[1])
             if period is not None:  # a quarter is left to the transient
@@ -496,7 +496,7 @@ class _Search:
             factors.append(np.stack([r, s], axis=1) / np.sqrt(counted)[:, None, None, None])
         return np.hstack(signals), np.concatenate(factors)
 
-    def limited(self, waves: Matrix) -> Matrix:
+    def limit(self, waves: Matrix) -> Matrix:
         """Return signals within the limits to the last bit, with steps shortened for rounding."""
         low, high = self.low, self.high
         u = np.clip((low + high) / 2 + (high - low) / 2 * waves, low, high)
@@ -541,19 +541,19 @@ class _Search:
         """
         length = min(self.samples, max(SEARCH_ROWS, SEARCH_PERIODS * period) + self.plant.start)
 
-        def tried(patterns: list[Pattern]) -> Vector:
+        def evaluate_patterns(patterns: list[Pattern]) -> Vector:
             waves = np.stack([pattern(length) for pattern in patterns], axis=1)
             periods = np.array([len(p.levels) * p.hold * (1 + p.odd) for p in patterns])
-            return self.scores(self.measured(waves, periods)[1]).ranked
+            return self.scores(self.measure(waves, periods)[1]).ranked
 
         starts = starting_patterns(period, seed)
-        pool = dict(zip(starts, tried(starts), strict=True))
+        pool = dict(zip(starts, evaluate_patterns(starts), strict=True))
         chosen = {
             (len(p.levels), p.odd): p for p in sorted(pool, key=lambda p: -pool[p])
         }  # the best of each length
         for pattern in sorted(chosen.values(), key=lambda p: pool[p])[:STARTS]:
             for _ in range(iterations):
-                values = tried(near := pattern.neighbours())
+                values = evaluate_patterns(near := pattern.neighbours())
                 k = int(np.argmin(values))
                 if not values[k] < pool[pattern] * (1 - LEAST_GAIN):
                     break

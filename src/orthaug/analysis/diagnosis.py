@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import counted, percent
+from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.inconsistency import inconsistency
@@ -74,7 +74,8 @@ def diagnose(
         >>> import numpy as np
         >>> import orthaug as oa
         >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
         >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
         >>> diagnose(oa.estimate(record, gain, learner=None)).verdict
         'unmodelled'
@@ -110,7 +111,7 @@ def _of_lagged(
     )
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
-        return _concluded(replace(seen, **_effects(fit, one_step, one_step, False)))
+        return _conclude(replace(seen, **_effects(fit, one_step, one_step, False)))
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
     free_runs = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
@@ -140,10 +141,10 @@ def _of_lagged(
         seen = replace(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
-    return _concluded(seen)
+    return _conclude(seen)
 
 
-def _concluded(seen: Finding) -> Diagnosis:
+def _conclude(seen: Finding) -> Diagnosis:
     """Return the verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
     if (
@@ -367,7 +368,7 @@ def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Wa
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         text = (
-            f"{counted(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
+            f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
             f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong samples "
             'there bias θ: mark them (step = "outliers" of data.prepare), or leave them out.'
         )

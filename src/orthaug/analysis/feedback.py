@@ -20,9 +20,9 @@ from orthaug.analysis.visited import (
     MOST_STEPS,
     RunPoint,
     RunPoints,
-    measured_by,
     positive,
-    visited_by,
+    sample_free_run,
+    sample_measured,
 )
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -37,7 +37,7 @@ MOST_WORK = 4e7  # rows times n0³
 _LONGEST_STATE = 200  # n0 with eigenvalues at all
 
 
-def linearised(
+def linearise_points(
     model: Model, visited: RunPoints
 ) -> tuple[RunPoints, Float[np.ndarray, "m n0 n0"], Vector]:
     """Return the points with finite derivatives, A_k there, and its spectral radii (m,)."""
@@ -85,13 +85,13 @@ def _transitions(
     """Return A_k at m points, by differences where a learner has no derivative."""
 
     def at(state: Any, row: Any) -> Any:
-        def following(state: Any) -> Any:
+        def next_state(state: Any) -> Any:
             return form.step(numbers, state, row)[0]
 
         return (
-            jax.jacrev(following)(state)
+            jax.jacrev(next_state)(state)
             if form.differentiable
-            else by_differences(following, state, width)
+            else by_differences(next_state, state, width)
         )
 
     return jax.vmap(at)(states, inputs)
@@ -142,12 +142,12 @@ def feedback(
         return None
     most = 0 if size > _LONGEST_STATE else min(MOST_STEPS, int(MOST_WORK / size**3))
     if along == "simulation":
-        run = visited_by(
+        run = sample_free_run(
             model, record, model.simulate(record) if response is None else response, most
         )
     else:
-        run = measured_by(model, record, most)
-    points, transition, radius = linearised(model, run.points)
+        run = sample_measured(model, record, most)
+    points, transition, radius = linearise_points(model, run.points)
     largest, worst = points.worst(record, radius, model.form.describe)
     median, share = (
         (float(np.median(radius)), float(np.mean(radius > 1 + 1e-6))) if worst else (None, None)

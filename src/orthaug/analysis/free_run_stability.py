@@ -70,7 +70,8 @@ def stability(
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> found = stability(oa.estimate(record, physics, learner=None).model, record)
         >>> print(found.diverges_at, round(found.contraction.rate, 6))

@@ -20,10 +20,10 @@ import scipy.special
 from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.memory import KINDS, MemoryTerm, filtered, memory_terms
+from orthaug.analysis.memory import KINDS, MemoryTerm, filter_signal, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
-from orthaug.analysis.whiteness import whitening
+from orthaug.analysis.whiteness import whitening_filter
 from orthaug.data.record import Record
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -145,7 +145,7 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
 
     None where the run leaves all bounds or has no slopes, or there are too few rows.
     """
-    settled = _settled(model, record)
+    settled = _fit_physics(model, record)
     if settled is None:
         return None
     theta, runs = settled
@@ -153,11 +153,13 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
     if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
         return None
     moved = theta - np.asarray(model.numbers.theta)
-    found = _tested(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
+    found = _test_families(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
     return None if found is None else replace(found, step=float(model.sampling_time))
 
 
-def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[LinearRun]] | None:
+def _fit_physics(
+    model: Model | MotionModel, record: Record
+) -> tuple[Vector, list[LinearRun]] | None:
     """Return parameters of the physics with the least filtered free-run errors, and the runs.
 
     They are found by Gauss-Newton steps.
@@ -171,11 +173,11 @@ def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[L
         return None
     for _ in range(_SETTLING):
         base = _base_columns(model, runs)
-        pieces, colours = _coloured(runs, base)
-        rows, nt = np.concatenate([_filtered(piece, colours) for piece in pieces]), len(theta)
+        pieces, colours = _colour_rows(runs, base)
+        rows, nt = np.concatenate([_filter_piece(piece, colours) for piece in pieces]), len(theta)
         step, before = (
             _least_squares(rows[:, :-1], rows[:, -1])[:nt],
-            _left(rows[:, nt:-1], rows[:, -1]),
+            _residual_sum(rows[:, nt:-1], rows[:, -1]),
         )
         scale, trial, after = _scale(runs), None, np.inf
         for _ in range(_HALVINGS):
@@ -183,9 +185,9 @@ def _settled(model: Model | MotionModel, record: Record) -> tuple[Vector, list[L
             if trial is not None:
                 beside = [one[..., nt:] for one in _base_columns(model, trial)]
                 moved = np.concatenate(
-                    [_filtered(piece, colours) for piece in _pieces(trial, beside, scale)]
+                    [_filter_piece(piece, colours) for piece in _pieces(trial, beside, scale)]
                 )
-                after = _left(moved[:, :-1], moved[:, -1])
+                after = _residual_sum(moved[:, :-1], moved[:, -1])
             if after < before:
                 break
             step = step / 4
@@ -203,7 +205,7 @@ def _least_squares(columns: Matrix, target: Vector) -> Vector:
     return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
 
 
-def _left(columns: Matrix, target: Vector) -> float:
+def _residual_sum(columns: Matrix, target: Vector) -> float:
     """Return the sum of squares that columns leave."""
     q = _range(columns)
     rest = target - q @ (q.T @ target)
@@ -353,7 +355,7 @@ def _added_columns(
             families += [_Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
                 values = _static(own[name], size) + [
-                    filtered(term, own[name], step) / size for term in terms
+                    filter_signal(term, own[name], step) / size for term in terms
                 ]
                 found.append(_respond(model, run, place, np.stack(values, axis=1)))
     return families, [np.concatenate(found, axis=2) for found in columns]
@@ -372,17 +374,19 @@ def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> 
     ]
 
 
-def _coloured(
+def _colour_rows(
     runs: list[LinearRun], base: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[Vector]]:
     """Return columns and errors, and the autoregression of each output's remaining errors."""
     pieces = _pieces(runs, base, _scale(runs))
-    rest = _beside([piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces])
-    colours = [whitening([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
+    rest = _residual_pieces(
+        [piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces]
+    )
+    colours = [whitening_filter([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
     return pieces, [np.ones(1) if a is None else a for a in colours]
 
 
-def _tested(
+def _test_families(
     runs: list[LinearRun],
     base: list[np.ndarray],
     families: list[_Family],
@@ -390,10 +394,10 @@ def _tested(
     shift: Vector,
 ) -> StructureTest | None:
     """Filter rows and columns by the colour of the remaining errors, and test every family."""
-    nt, known, colours = len(shift), base[0].shape[2], _coloured(runs, base)[1]
+    nt, known, colours = len(shift), base[0].shape[2], _colour_rows(runs, base)[1]
     both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
     whole = np.concatenate(
-        [_filtered(piece, colours) for piece in _pieces(runs, both, _scale(runs))]
+        [_filter_piece(piece, colours) for piece in _pieces(runs, both, _scale(runs))]
     )
     if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
         return None
@@ -414,20 +418,20 @@ def _tested(
     hidden = _family_tests(whole, own + simple, known, families, size, None)
     memory = [entry for entry in beside if entry.kind != "static"]
     return StructureTest(
-        _best([entry for entry in beside if entry.kind == "static"]),
-        _best(memory),
-        _best([entry for entry in hidden if entry.kind != "static"]),
+        _best_family([entry for entry in beside if entry.kind == "static"]),
+        _best_family(memory),
+        _best_family([entry for entry in hidden if entry.kind != "static"]),
         tuple(sorted(memory, key=lambda entry: -entry.share)),
     )
 
 
-def _best(entries: list[FamilyTest]) -> FamilyTest | None:
+def _best_family(entries: list[FamilyTest]) -> FamilyTest | None:
     return max(
         (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
     )
 
 
-def _beside(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
+def _residual_pieces(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
     """Return the errors that least squares on the columns leaves, pieces of (T, ny)."""
     flat, lengths = np.concatenate(columns), np.cumsum([len(piece) for piece in columns])[:-1]
     target, ny = np.concatenate(errors), errors[0].shape[1]
@@ -446,7 +450,7 @@ def _range(columns: Matrix) -> Matrix:
     return u[:, s > 1e-9 * s[0]]
 
 
-def _filtered(piece: np.ndarray, colours: list[Vector]) -> Matrix:
+def _filter_piece(piece: np.ndarray, colours: list[Vector]) -> Matrix:
     """Return columns and errors (T, ny, k), filtered by the autoregression of each output."""
     memory = max(map(len, colours)) - 1
     rows = np.stack(

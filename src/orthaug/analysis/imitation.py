@@ -74,7 +74,7 @@ class Imitation:
     @property
     def text(self) -> str:
         """In sentences."""
-        sees = f"The learner sees {_listed(self.inputs)}"
+        sees = f"The learner sees {_list_words(self.inputs)}"
         if self.terms:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
@@ -85,24 +85,27 @@ class Imitation:
         if self.held:
             are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
             sees = (
-                f"{_listed(self.held)} {are} at a bound: the orthogonal split does not move "
+                f"{_list_words(self.held)} {are} at a bound: the orthogonal split does not move "
                 f"{them}. {sees}"
             )
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
             return f"{text}: the fit determines every{rest} parameter beside it.{self._nearly}"
-        could = _listed([_combination(direction) for direction in self.directions])
+        could = _list_words([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
             f"{sees} and could imitate {could}. The orthogonal split sets θ along {along} only."
         ]
         if self.determined:
             sentences.append(
-                f"The fit determines {_listed(self.determined)} beside any learner of these inputs."
+                f"The fit determines {_list_words(self.determined)} "
+                "beside any learner of these inputs."
             )
         if self.physical:
-            sentences.append(f"Of the physical parameters it determines {_listed(self.physical)}.")
+            sentences.append(
+                f"Of the physical parameters it determines {_list_words(self.physical)}."
+            )
         return " ".join(sentences) + self._nearly
 
     @property
@@ -167,7 +170,7 @@ def imitation(
         held: parameters at a bound.
     """
     slopes = _slopes(problem, physics)
-    own = problem.shared.leaving([problem.baseline.names.index(name) for name in held])
+    own = problem.shared.without_entries([problem.baseline.names.index(name) for name in held])
     inputs = tuple(str(entry) for entry in problem.features.entries)
     alternatives = []
     for other in other_inputs(problem) if others and not problem.features.linear else ():
@@ -176,9 +179,9 @@ def imitation(
             problem.baseline, features, problem.layout, problem.outputs, problem.rows.x
         )
         if not shared.all and set(other) != set(inputs):
-            alternatives.append(Alternative.of(other, shared, _untouched(shared, slopes)))
+            alternatives.append(Alternative.of(other, shared, _unmoved_parameters(shared, slopes)))
     shown, terms = tuple(alternatives[:_ALTERNATIVES]), problem.features.linear
-    found = Imitation.of(inputs, own, _untouched(own, slopes), shown, terms, tuple(held))
+    found = Imitation.of(inputs, own, _unmoved_parameters(own, slopes), shown, terms, tuple(held))
     determined = tuple(name for name in found.determined if name not in held)
     return replace(
         found, determined=determined, weakest=_weakest(problem, determined) if terms else None
@@ -223,7 +226,9 @@ def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarra
     return None if found is None else found[0]
 
 
-def _untouched(shared: Shared, slopes: dict[str, np.ndarray] | None) -> tuple[str, ...] | None:
+def _unmoved_parameters(
+    shared: Shared, slopes: dict[str, np.ndarray] | None
+) -> tuple[str, ...] | None:
     """Return the physical parameters that no shared direction moves."""
     if slopes is None:
         return None
@@ -257,7 +262,7 @@ def _combination(direction: dict[str, float]) -> str:
     return text
 
 
-def _listed(words: tuple[str, ...] | list[str]) -> str:
+def _list_words(words: tuple[str, ...] | list[str]) -> str:
     return (
         words[0]
         if len(words) == 1

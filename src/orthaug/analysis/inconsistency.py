@@ -134,7 +134,7 @@ class _Rows(NamedTuple):
             begin += len(piece)
         return columns.reshape(errors.size, ny * order)
 
-    def filtered(self, columns: Matrix, rho: Matrix) -> Matrix:
+    def filter_columns(self, columns: Matrix, rho: Matrix) -> Matrix:
         """Return `x_k − Σ_j ρ_j x_{k−j}` of columns (N ny, r), ρ (ny, order)."""
         ny = len(rho)
         x = columns.reshape(-1, ny, columns.shape[1])
@@ -265,14 +265,14 @@ def _with_colour(rows: _Rows, order: int) -> tuple[Vector | None, Vector]:
 
     def parts(moved: Vector, rho: Matrix) -> tuple[Vector, Vector, float]:
         errors = rows.errors.ravel() - a @ moved
-        white = rows.filtered(errors[:, None], rho)[:, 0]
+        white = rows.filter_columns(errors[:, None], rho)[:, 0]
         prior = 2 * rows.pull @ moved + moved @ rows.stiff @ moved
         return errors, white, float(white @ white + prior)
 
     errors, white, loss = parts(moved, rho)
     for _ in range(_STEPS):
         past = rows.past(errors.reshape(rows.errors.shape), order)
-        jacobian = np.column_stack([rows.filtered(a, rho), past])
+        jacobian = np.column_stack([rows.filter_columns(a, rho), past])
         normal = jacobian.T @ jacobian
         normal[:r, :r] += rows.stiff
         gradient = jacobian.T @ white

@@ -20,10 +20,10 @@ from orthaug.analysis.whiteness import (
     LARGEST,
     Pieces,
     cross_correlation,
-    cut,
     pieces_of,
-    standardised,
-    whitening,
+    split_like,
+    standardise,
+    whitening_filter,
 )
 
 # Rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
@@ -91,8 +91,8 @@ def against_input(
         a: `whitening(residual)`, where it is known already.
     """
     values = cross_correlation(residual, inputs, lags)
-    e, u = standardised(residual), standardised(inputs)
-    a = whitening(residual, lags) if a is None else a
+    e, u = standardise(residual), standardise(inputs)
+    a = whitening_filter(residual, lags) if a is None else a
     if values is None or e is None or u is None or a is None:
         return None
     band = float(
@@ -128,7 +128,7 @@ def against_regressor(
         a: `whitening(residual)`, where it is known already.
     """
     e, x = pieces_of(residual), np.concatenate(pieces_of(regressor))
-    a = whitening(e) if a is None else a
+    a = whitening_filter(e) if a is None else a
     placed = _bins(x, bins)
     if a is None or placed is None:
         return None
@@ -139,7 +139,9 @@ def against_regressor(
     means = np.bincount(placed, whole) / counts
     total, explained = float(whole @ whole), float(counts @ means**2)
     within = np.sqrt(max(total - explained, 0.0) / (len(whole) - len(counts)))
-    found = _relation(_bin_blocks(cut(whole, e), cut(placed, e), a, len(counts)), intercept=centred)
+    found = _relation(
+        _bin_blocks(split_like(whole, e), split_like(placed, e), a, len(counts)), intercept=centred
+    )
     errors = within / np.sqrt(counts)
     if found is not None and found.rank == len(counts) - centred:
         contrast = np.eye(len(counts)) - centred * counts / len(whole)  # to the mean of all rows

@@ -81,11 +81,11 @@ def try_holds(
     """
     task = on_longest(problem, criterion, solver, structure, learner)
     motion, free_fit = problem.motion, task.physics
-    found = [_held(task.plan, free_fit, declared=True)]
+    found = [_declared_trial(task.plan, free_fit, declared=True)]
     several = motion.integrator != "discrete" and bool(motion.inputs) and free_fit is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
-            found.append(_under(hold, task, solver))
+            found.append(_try_hold(hold, task, solver))
     substeps = None if free_fit is None else task.plan.dynamics.substeps
     return Trial(len(task.problem.record), substeps, tuple(found), task)
 
@@ -103,21 +103,21 @@ def on_longest(
     """
     longest = max(problem.record.experiments, key=len)
     record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
-    return MotionTask.of(problem.on(record), learner, criterion).prepared(solver, structure)
+    return MotionTask.of(problem.on(record), learner, criterion).prepare(solver, structure)
 
 
-def _under(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
+def _try_hold(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
     assert task.physics is not None
     try:
         motion = replace(task.problem.motion, hold=hold)
-        return _held(
-            *refitted(task, task.physics, motion, task.problem.record, solver), declared=False
+        return _declared_trial(
+            *refit_physics(task, task.physics, motion, task.problem.record, solver), declared=False
         )
     except InputError:
         return HoldTrial(hold, None, False)
 
 
-def refitted(
+def refit_physics(
     task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Return the physics trained on from the end of a fit, with another motion or record.
@@ -131,7 +131,7 @@ def refitted(
     segmented = SegmentedMotion.of(
         replace(plan.problem, motion=motion, record=record), None, plan.criterion
     )
-    segmented = segmented.alone.refined(plan.dynamics.substeps).from_states(
+    segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps).from_states(
         free_fit.end.point.states
     )
     again = segmented.descend(
@@ -153,7 +153,9 @@ def residual_of(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> floa
     return value if np.isfinite(value) else float("inf")
 
 
-def _held(segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool) -> HoldTrial:
+def _declared_trial(
+    segmented: SegmentedMotion, free_fit: FreeRunFit | None, *, declared: bool
+) -> HoldTrial:
     motion, value = segmented.problem.motion, residual_of(segmented, free_fit)
     if free_fit is None or value == float("inf"):
         return HoldTrial(motion.hold, None, declared)
@@ -212,7 +214,7 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
         delays = _Delays(
             task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)}
         )
-        best = _least(delays.leaves, most)
+        best = _lowest_argument(delays.leaves, most)
         if delays.leaves(best) < (1 - _LATE) * delays.leaves(0):
             found.append(DeadTime(name, best, delays.leaves(best), delays.leaves(0)))
     return tuple(found)
@@ -235,13 +237,13 @@ class _Delays:
                 min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
             ][1]
             problem = self.task.problem
-            late = _delayed(problem.record, self.number, samples)
-            segmented, free_fit = refitted(self.task, near, problem.motion, late, self.solver)
+            late = _delay_input(problem.record, self.number, samples)
+            segmented, free_fit = refit_physics(self.task, near, problem.motion, late, self.solver)
             self.tried[samples] = residual_of(segmented, free_fit), free_fit or self.tried[0][1]
         return self.tried[samples][0]
 
 
-def _least(leaves: Callable[[int], float], most: int) -> int:
+def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
     """Return the argument from 0 on at which a function that falls and then rises is least."""
     best, step = 0, 1
     while step <= most and leaves(step) < leaves(best):
@@ -253,13 +255,13 @@ def _least(leaves: Callable[[int], float], most: int) -> int:
     return best
 
 
-def _delayed(record: Record, number: int, samples: int) -> Record:
+def _delay_input(record: Record, number: int, samples: int) -> Record:
     """Return an input later by so many samples.
 
     Before the record it has its first value.
     """
 
-    def moved(inputs: np.ndarray) -> np.ndarray:
+    def shift(inputs: np.ndarray) -> np.ndarray:
         column = inputs[:, number]
         late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[
             : len(column)
@@ -267,5 +269,5 @@ def _delayed(record: Record, number: int, samples: int) -> Record:
         return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
 
     return replace(
-        record, experiments=tuple(replace(e, inputs=moved(e.inputs)) for e in record.experiments)
+        record, experiments=tuple(replace(e, inputs=shift(e.inputs)) for e in record.experiments)
     )

@@ -179,7 +179,7 @@ def _unrest(step: Step, numbers: Numbers, point: Any) -> Any:
     return jnp.concatenate(step.unrest(numbers, rest, inputs))
 
 
-def _moved(numbers: Numbers, unknowns: Any) -> Numbers:
+def _replace_unknowns(numbers: Numbers, unknowns: Any) -> Numbers:
     """Return the numbers with others for (θ, weights), or for θ alone."""
     nt = len(numbers.theta)
     weights = unknowns[nt:] if len(unknowns) > nt else numbers.weights
@@ -193,7 +193,7 @@ def unrest_along(
     """Return the change of rest's residual and of the outputs along columns of `root` (n, r)."""
 
     def of(p: Any) -> Any:
-        return _unrest(step, _moved(numbers, p), jnp.concatenate([rest, inputs]))
+        return _unrest(step, _replace_unknowns(numbers, p), jnp.concatenate([rest, inputs]))
 
     return jax.vmap(lambda d: jax.jvp(of, (unknowns,), (d,))[1], -1, -1)(root)
 
@@ -256,7 +256,7 @@ def slope_along(
     """
 
     def of(rest: Any, inputs: Any, p: Any) -> Any:
-        return _slope(step, field, _moved(numbers, p), rest, inputs, None)
+        return _slope(step, field, _replace_unknowns(numbers, p), rest, inputs, None)
 
     point = (rest, inputs, unknowns)
     return jax.vmap(lambda *d: jax.jvp(of, point, d)[1], -1, 0)(*along)

@@ -81,12 +81,12 @@ class System:
         """Return `C (zI − A)⁻¹ B + D` at m points of the plane."""
         n = self.states
         inverse = z[:, None, None] * np.eye(n) - self.a
-        right = _solved(inverse, np.broadcast_to(self.b.astype(complex), (len(z), *self.b.shape)))
+        right = _solve(inverse, np.broadcast_to(self.b.astype(complex), (len(z), *self.b.shape)))
         value = self.c @ right + self.d
         if self.moved is None:
             return Response(value, None)
         outputs = np.broadcast_to(self.c.T.astype(complex), (len(z), *self.c.T.shape))
-        left = np.swapaxes(_solved(np.swapaxes(inverse, 1, 2), outputs), 1, 2)
+        left = np.swapaxes(_solve(np.swapaxes(inverse, 1, 2), outputs), 1, 2)
         ny, nu = self.d.shape
         left = np.concatenate([left, np.broadcast_to(np.eye(ny), (len(z), ny, ny))], axis=2)
         right = np.concatenate([right, np.broadcast_to(np.eye(nu), (len(z), nu, nu))], axis=1)
@@ -201,7 +201,7 @@ def _right(a: Matrix, value: complex, start: Any) -> Any:
     return start / np.linalg.norm(start)
 
 
-def _solved(left: Any, right: Any) -> Any:
+def _solve(left: Any, right: Any) -> Any:
     """Return `left⁻¹ right`; NaN at a pole."""
     if not left.shape[-1]:
         return np.zeros(right.shape, dtype=complex)
@@ -228,7 +228,7 @@ class Continuous:
     states: tuple[str, ...]
 
 
-def converted(
+def convert_to_continuous(
     system: System, method: str, memory: Memory | None, names: tuple[str, ...]
 ) -> Continuous | str:
     """Return the system in continuous time, or why there is none."""

@@ -224,7 +224,7 @@ class LinearView:
         )
 
 
-def about(value: Any, relative: Any, freedom: float) -> Any:
+def log_intervals(value: Any, relative: Any, freedom: float) -> Any:
     """Return intervals (…, 2) of positive values whose logarithms are normal."""
     with np.errstate(all="ignore"):
         times = np.exp(reach(freedom) * relative)
@@ -243,7 +243,7 @@ def bode_of(system: System, frequency: Vector, freedom: float) -> Bode:
         relative = found.moved / found.value[:, None]
     gain, turn = (np.sqrt(np.sum(part**2, axis=1)) for part in (relative.real, relative.imag))
     phases = interval(phase_of(found.value), np.degrees(turn), freedom)
-    return Bode(frequency, found.value, about(np.abs(found.value), gain, freedom), phases)
+    return Bode(frequency, found.value, log_intervals(np.abs(found.value), gain, freedom), phases)
 
 
 def gain_of(system: System, freedom: float) -> tuple[Matrix | None, Any]:
@@ -272,14 +272,14 @@ def poles_of(system: System, own: System | None, freedom: float) -> tuple[Pole, 
     if own is None:
         logs = [(np.log(z) / step, None if r is None else r / step) for z, r in found]
     else:
-        logs = _matched(modes.values, own, step)
+        logs = _match_poles(modes.values, own, step)
     return tuple(
         _pole(z, r, s, d, own is not None, freedom)
         for (z, r), (s, d) in zip(found, logs, strict=True)
     )
 
 
-def _matched(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
+def _match_poles(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
     """Return the equations' poles in the order of the sampled ones, each with how it moves."""
     from scipy.optimize import linear_sum_assignment
 
@@ -297,7 +297,9 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
     """Return a pole with `relative` = δz/z and `moved` = δs along the covariance."""
     size = lambda part: float(np.sqrt(np.sum(part**2)))  # noqa: E731
     magnitude = float(abs(z))
-    radius = None if relative is None else _pair(about(magnitude, size(relative.real), freedom))
+    radius = (
+        None if relative is None else _pair(log_intervals(magnitude, size(relative.real), freedom))
+    )
     alternates = z.real < 0 and abs(z.imag) <= _REAL * magnitude and not exact
     if alternates or abs(s) <= 1e-12:
         return Pole(
@@ -315,7 +317,7 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
             if real
             else _pair(np.clip(interval(damping, sine * size(change.imag), freedom), -1.0, 1.0))
         )
-        spans = (_pair(about(frequency, size(change.real), freedom)), turn)
+        spans = (_pair(log_intervals(frequency, size(change.real), freedom)), turn)
     return Pole(
         complex(z),
         complex(s),

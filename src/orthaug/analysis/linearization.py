@@ -20,7 +20,7 @@ from orthaug.analysis.linear_steps import (
     step_of,
     unrest_along,
 )
-from orthaug.analysis.linear_system import METHODS, Continuous, System, converted
+from orthaug.analysis.linear_system import METHODS, Continuous, System, convert_to_continuous
 from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
@@ -73,7 +73,8 @@ def linearize(
     Examples:
         >>> import orthaug as oa
         >>> u = [1.0, 2.0, 0.0, 3.0, 1.0, 0.0]
-        >>> record = oa.Record.from_arrays(u=u, y=[0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625])  # 0.5 (y[k-1] + u[k-1])
+        >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
+        >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
         >>> round(linearize(oa.estimate(record, physics, learner=None))[0].poles[0].z.real, 6)
         0.5
@@ -107,10 +108,10 @@ def linearize(
         warnings.append(Warning("hold_replaced", text))
     views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
     measured = None if record is None else measured_response(record)
-    return Linearization(views, measured, _held(search, given, record), tuple(warnings))
+    return Linearization(views, measured, _held_clause(search, given, record), tuple(warnings))
 
 
-def _held(search: Search, given: Mapping[str, float], record: Record | None) -> str:
+def _held_clause(search: Search, given: Mapping[str, float], record: Record | None) -> str:
     """Return a clause on the source of inputs that nobody fixed."""
     if all(name in given for name in search.step.inputs):
         return "given"
@@ -192,7 +193,7 @@ def _view(
         own = _system(search, point, spread, None)
         found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
-        found = converted(
+        found = convert_to_continuous(
             sampled, method, None if isinstance(step, MotionStep) else step.memory, names
         )
     poles = poles_of(sampled, own, freedom)
@@ -214,10 +215,10 @@ def _view(
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
     if isinstance(model, MotionModel):
         units |= {state.name: state.unit for state in model.form.motion.states}
-    return LinearView(
-        point, sampled, found, poles, sampled.modes.at_zero, gain, gain_ci95, bode, names, step.inputs,
-        tuple(channel.name for channel in model.outputs), units, freedom, tuple(warnings), smooth,
-    )  # fmt: skip
+    outputs = tuple(channel.name for channel in model.outputs)
+    modes = sampled.modes.at_zero
+    seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)
+    return LinearView(*seen, units, freedom, tuple(warnings), smooth)
 
 
 def _system(
@@ -238,7 +239,7 @@ def _system(
         ne, root = len(point.rest), spread.root
         change = np.asarray(unrest_along(step, numbers, point.rest, point.inputs, unknowns, root))
         rows = [*range(ne), *(ne + i for i in point.slopes.outputs)]
-        along = point.slopes.following(change[rows])
+        along = point.slopes.follow(change[rows])
         moved = np.asarray(
             slope_along(
                 step,

@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences, difference_width
-from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, evenly, positive, usable
+from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, even_indices, positive, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -78,8 +78,8 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     """
     if not isinstance(form := model.form, Lagged):
         return None
-    stacked, every, y_scale = _measured(model, record, x)
-    some = evenly(len(every), MOST_STEPS)
+    stacked, every, y_scale = _measured_regressors(model, record, x)
+    some = even_indices(len(every), MOST_STEPS)
     x, where, x_scale = stacked[some], every.take(some), stacked.std(axis=0)
 
     def entries(i: int) -> dict[str, float]:
@@ -113,7 +113,9 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     return Lipschitz(*largest, rows=len(x), weights_rows=len(fewer))
 
 
-def _measured(model: Model, record: Record, x: Matrix | None) -> tuple[Matrix, RowIndex, Vector]:
+def _measured_regressors(
+    model: Model, record: Record, x: Matrix | None
+) -> tuple[Matrix, RowIndex, Vector]:
     """Return measured regressors, the row of each, and deviations of the outputs (ny,)."""
     form, record = model.form, usable(model, record)
     lengths = [len(e) - form.first_row for e in record.experiments]
@@ -160,7 +162,7 @@ def _weight_sizes(
     cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
     if not form.differentiable or not cells * len(directions):
         return np.arange(0), np.zeros(0), np.zeros(0)
-    some = evenly(len(x), max(_FEWEST, _MOST_CELLS // (cells * len(directions))))
+    some = even_indices(len(x), max(_FEWEST, _MOST_CELLS // (cells * len(directions))))
     size = min(_BATCH, max(1, _BATCH_CELLS // cells))
     squares = []
     for begin in range(0, len(some), size):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.absorbed import TermAfterFit, absorbed
+from orthaug.analysis.absorbed import TermAfterFit, term_effects
 from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
 from orthaug.inference.covariance import reach
@@ -19,7 +19,7 @@ from orthaug.inference.physical import PhysicalEstimate, solve
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
-from orthaug.physics.shared import seen
+from orthaug.physics.shared import seen_columns
 
 # Of a measure at most, over which certificates are sought for suspects that no one named
 CERTIFIED_ROWS = 200_000
@@ -76,7 +76,7 @@ class MeasureLinearization:
             learned=self.learned,
             certify=certify,
             directions=self.directions,
-            absorbed=None if self.directions is None else self._absorbed(chosen),
+            absorbed=None if self.directions is None else self._absorbed_effects(chosen),
         )
 
     @cached_property
@@ -96,13 +96,13 @@ class MeasureLinearization:
         held = (
             self.values(entry.suspect)
             if self.directions is None
-            else self._absorbed([entry.suspect])[0].held
+            else self._absorbed_effects([entry.suspect])[0].held
         )
         return replace(
             self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
         )
 
-    def _absorbed(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
+    def _absorbed_effects(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
         problem = self.problem
         layout, outputs = problem.layout, problem.outputs
 
@@ -117,9 +117,11 @@ class MeasureLinearization:
             along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
             return lambda x: along[:: -(-len(along) // len(x))]  # on all rows, or every so many
 
-        of_static = iter(seen(problem.features, layout, problem.rows.x, forms) if static else ())
+        of_static = iter(
+            seen_columns(problem.features, layout, problem.rows.x, forms) if static else ()
+        )
         visible = [suspect.memory is None and bool(next(of_static)) for suspect in suspects]
-        return absorbed(problem, map(term, suspects), visible, self.weighed.points.x)
+        return term_effects(problem, map(term, suspects), visible, self.weighed.points.x)
 
 
 def bias_under(
@@ -149,7 +151,7 @@ def bias_under(
         own = {
             "relative_physical_bias": _relative(entry, linearization.slopes),
             "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
-            "expected_physical_bias": _expected(
+            "expected_physical_bias": _expected_shifts(
                 entry, linearization.physics, problem, linearization.theta
             ),
         }
@@ -157,7 +159,7 @@ def bias_under(
     return found
 
 
-def _expected(
+def _expected_shifts(
     entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
 ) -> dict[str, dict[str, float | None]] | None:
     """Return the shift of each physical parameter by the guessed coefficient.
@@ -208,10 +210,10 @@ def physical_of(
     physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
 ) -> Vector:
     """Return p of θ, weighted by its covariance where that is given."""
-    return _solved(physics, problem, theta, covariance).value
+    return _solve_physical(physics, problem, theta, covariance).value
 
 
-def _solved(
+def _solve_physical(
     physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None
 ) -> PhysicalEstimate:
     order = _order(physics, problem)
@@ -242,10 +244,11 @@ def physical_with_bias(
     assert physics is not None
     centre, order = linearization.theta - bias, _order(physics, problem)
     now, free = (
-        _solved(physics, problem, theta, covariance) for theta in (linearization.theta, centre)
+        _solve_physical(physics, problem, theta, covariance)
+        for theta in (linearization.theta, centre)
     )
     ends = np.full((len(free.value), 2), np.nan)
-    if not _met(free):
+    if not _is_met(free):
         return ends[:, 0], ends
     if free.sensitivities is None or covariance is None:
         return now.value - free.value, ends
@@ -261,13 +264,13 @@ def physical_with_bias(
         size = np.sqrt(row @ spread @ row)
         step = reach(freedom) * spread @ row / (size if size > 0 else 1.0)
         for side, sign in enumerate((-1.0, 1.0) if np.isfinite(step).all() else ()):
-            end = _solved(physics, problem, centre + sign * step, covariance)
+            end = _solve_physical(physics, problem, centre + sign * step, covariance)
             beyond = sign * (end.value[i] - free.value[i]) >= -_ROUNDING * abs(free.value[i])
-            ends[i, side] = end.value[i] if _met(end) and beyond else physics.bounds[side][i]
+            ends[i, side] = end.value[i] if _is_met(end) and beyond else physics.bounds[side][i]
     return now.value - free.value, ends
 
 
-def _met(found: PhysicalEstimate) -> bool:
+def _is_met(found: PhysicalEstimate) -> bool:
     """Return whether there is p that gives θ."""
     return all(warning.code != "physics_not_met" for warning in found.warnings)
 

@@ -43,8 +43,8 @@ class MemoryTerm:
         return f"{WORDS[self.kind]} of {self.on}, {symbol} {self.scale:.3g}{unit}"
 
     def along(self, values: Vector, sampling_time: float) -> Vector:
-        """Return the internal state along a signal (N,), as `filtered`."""
-        return filtered(self, values, sampling_time)
+        """Return the internal state along a signal (N,), as `filter_signal`."""
+        return filter_signal(self, values, sampling_time)
 
 
 def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
@@ -55,7 +55,7 @@ def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTe
     return terms + [MemoryTerm(kind, on, share * size) for kind in KINDS[1:] for share in WIDTHS]
 
 
-def filtered(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
+def filter_signal(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
     """Compute the internal state of a term along a signal (N,), from rest at its first value.
 
     A lag is exact for a held input. The others are driven by the increments d of the signal:

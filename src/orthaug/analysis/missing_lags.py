@@ -25,7 +25,7 @@ from orthaug.inference.covariance import newey_west
 from orthaug.models.response import Response
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
-from orthaug.physics.shared import seen
+from orthaug.physics.shared import seen_columns
 
 LEVEL = 0.01
 _FARTHEST = 4.0  # deviations: farther values count as this far
@@ -101,7 +101,7 @@ def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags
         or not problem.features.entries
     ):
         return None
-    visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+    visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [j for j, one in enumerate(visible) if not one]
     if not hidden or len(problem.rows) < _FEWEST_ROWS:
         return None
@@ -122,13 +122,13 @@ def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tupl
     phi = times(gain, np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)))
     phi = phi / np.maximum(np.sqrt(np.sum(phi**2, axis=(0, 1))), np.finfo(float).tiny)
     physics = _orthonormal(smoother.left(phi).reshape(rows * ny, phi.shape[2]), 1.0)
-    e = _without(physics, e.reshape(-1)).reshape(rows, ny)
+    e = _project_out(physics, e.reshape(-1)).reshape(rows, ny)
     cuts = _experiments(problem, len(e), smoother.every.step or 1)
     found = []
     for j in hidden:
         forms = _functions(x[:, j], smoother.inputs)
         stacked = np.einsum("kh,io->kioh", forms, np.eye(ny)).reshape(rows, ny, forms.shape[1] * ny)
-        left = _without(physics, smoother.left(stacked).reshape(rows * ny, forms.shape[1] * ny))
+        left = _project_out(physics, smoother.left(stacked).reshape(rows * ny, forms.shape[1] * ny))
         basis = _orthonormal(left, np.sqrt(rows))
         test = _score_test(basis.reshape(rows, ny, basis.shape[1]), e, cuts)
         if test is not None:
@@ -172,7 +172,7 @@ def _orthonormal(columns: Matrix, size: float) -> Matrix:
     return u[:, sigma > _RESOLVED * size]
 
 
-def _without(basis: Matrix, values: np.ndarray) -> np.ndarray:
+def _project_out(basis: Matrix, values: np.ndarray) -> np.ndarray:
     return values - basis @ (basis.T @ values)
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.analysis.suspects import changes_sign
-from orthaug.analysis.whiteness import whitening
+from orthaug.analysis.whiteness import whitening_filter
 from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
@@ -64,7 +64,7 @@ def _slopes(
     inputs: Float[Array, "nu m"],
 ) -> Any:
     """Return ∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
 
 
@@ -99,7 +99,7 @@ def sensitivities(
     to_next, value, to_output = _at_rows(form, numbers, x, u)
     with np.errstate(all="ignore"):
         added = terms(points)(rows.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
-        columns = _followed(to_next, to_output, added, equations, form)
+        columns = _propagate(to_next, to_output, added, equations, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():
         return None
@@ -125,7 +125,7 @@ def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[An
     return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
 
 
-def _followed(
+def _propagate(
     to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics
 ) -> Any:
     """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
@@ -249,7 +249,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     if not fit.segmented.dynamics.differentiable:
         return None
     names = (*motion.names_of_states, *motion.inputs)
-    equations = doubted(fit)
+    equations = doubted_equations(fit)
     count = 1 + len(SHAPES) * len(names)
     found_of: list[tuple[Vector, list[bool]]] = []
 
@@ -262,7 +262,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     found = sensitivities(fit, equations, terms, count)
     if found is None:
         return None
-    tested = _tested(found)
+    tested = _joint_test(found)
     if tested is None:
         return None
     p, freedom, share, gains, shares, coefficients = tested
@@ -271,7 +271,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     return MissingTest(p, freedom, share, tuple(listed))
 
 
-def doubted(fit: MotionEstimate) -> tuple[int, ...]:
+def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:
     """Return the equations with a parameter or a learner; others, such as ẋ = v, define a state.
 
     All, if there is none.
@@ -329,7 +329,7 @@ def _term(
     )
 
 
-def _tested(
+def _joint_test(
     found: Sensitivities,
 ) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
     """Return p, degrees of freedom and share of all terms.
@@ -378,7 +378,7 @@ def _regression(
     found: Sensitivities, filters: tuple[list[Vector], Vector] | None
 ) -> _Regression | None:
     """Return filtered terms and errors, with starts and all unknowns projected out."""
-    rows = [_filtered(found, i, filters) for i in range(len(found.scored))]
+    rows = [_filter_segment(found, i, filters) for i in range(len(found.scored))]
     parts, used = [], 0
     for block in rows:  # the starts move their own segment only
         starts, rest = block[:, : found.starts], block[:, found.starts :]
@@ -409,7 +409,7 @@ def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
     return u[:, s > rank * s[0]]
 
 
-def _filtered(
+def _filter_segment(
     found: Sensitivities, segment: int, filters: tuple[list[Vector], Vector] | None
 ) -> Matrix:
     """Return columns and errors of one segment, outputs stacked, filtered by their colours."""
@@ -440,10 +440,10 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
     """Return the autoregression of each output's remaining errors, and their innovations' size."""
     ny = found.errors.shape[2]
     pieces: list[list[Vector]] = [[] for _ in range(ny)]
-    for one in _cut(found, left):
+    for one in _cut_segments(found, left):
         for o, part in enumerate(one.reshape(ny, -1)):
             pieces[o].append(part)
-    coefficients = [whitening(own) for own in pieces]
+    coefficients = [whitening_filter(own) for own in pieces]
     known = [np.ones(1) if a is None else a for a in coefficients]
     unit = []
     for own, a in zip(pieces, known, strict=True):
@@ -456,7 +456,7 @@ def _filters(found: Sensitivities, left: Vector) -> tuple[list[Vector], Vector]:
     return known, np.array(unit) * np.where(scale > 0, scale, 1.0)
 
 
-def _cut(found: Sensitivities, whole: Vector) -> Iterator[Vector]:
+def _cut_segments(found: Sensitivities, whole: Vector) -> Iterator[Vector]:
     """Yield a vector over all rows in the pieces of its segments."""
     ny, place = found.errors.shape[2], 0
     for there in found.scored:

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
-from orthaug.analysis.absorbed import completing
+from orthaug.analysis.absorbed import complementary_parameters
 from orthaug.analysis.bias import IN_SPAN, Certificate, SuspectedBias, find_certificate
 from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.motion_suspects import (
     MotionSuspect,
     check_motion_suspects,
     equations_of,
-    softened,
+    soften_jumps,
     usual_motion_suspects,
 )
 from orthaug.analysis.robustness import block_of
@@ -162,19 +162,21 @@ class MotionLinearization:
         A row is multiplied by the root of its weight over its size.
         """
         slopes = np.asarray(
-            slopes_at(self.place.segmented.dynamics.alone, self.q, self.field.x, self.field.u)
+            slopes_at(
+                self.place.segmented.dynamics.physics_only, self.q, self.field.x, self.field.u
+            )
         )
         slopes = slopes[:, learned_places(self.motion)]
-        return Projection.factor(self.weighed(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
+        return Projection.factor(self.weigh(np.moveaxis(slopes, 2, 0)).transpose(1, 2, 0))
 
-    def weighed(self, rows: np.ndarray) -> np.ndarray:
+    def weigh(self, rows: np.ndarray) -> np.ndarray:
         """Return rows (M, nl) times the root of their weights over their sizes."""
         return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
         """Return the usual suspects, with widths from the range of the run."""
         place = self.place
-        segmented = place.segmented if len(place.w) else place.segmented.alone
+        segmented = place.segmented if len(place.w) else place.segmented.physics_only
         x, u = segmented.trajectory(place.c, place.w, place.states)
         there = np.isfinite(x).all(axis=1)
         on = [entry.text for entry in segmented.problem.features]
@@ -219,13 +221,13 @@ class MotionLinearization:
         apart = (
             np.zeros(len(names), dtype=bool)
             if trained
-            else ~np.isin(np.arange(len(names)), completing(basis))
+            else ~np.isin(np.arange(len(names)), complementary_parameters(basis))
         )
         moved, dw = response.moved(k, apart)
         if self.learns:
             delta = self._rows(suspect, place)
             held = delta if seen else response.held(dw, self.field.x, self.field.u)
-            held = self.weighed(held)
+            held = self.weigh(held)
             if not seen and trained and self.slope is not None:
                 moved = self.slope @ np.concatenate([moved, dw])
             elif basis.shape[1]:
@@ -233,8 +235,8 @@ class MotionLinearization:
             elif seen:
                 moved = np.zeros(len(names))
             if basis.shape[1] and len(held) <= CERTIFIED_POINTS and np.any(delta):
-                certificate = find_certificate(self.phi, self.weighed(delta), basis)
-            explained, found = self._explained(held)
+                certificate = find_certificate(self.phi, self.weigh(delta), basis)
+            explained, found = self._explained_share(held)
         moved = np.where(np.isin(names, self.unknown), np.nan, moved)
         coordinates = motion.coordinates
         value, per_unit = coordinates.physical(self.q), coordinates.slopes(self.q) * moved
@@ -260,13 +262,13 @@ class MotionLinearization:
         rest, found = replace(self, learned=learned), []
         for entry in table:
             if entry.seen and entry.suspect not in gone:
-                explained, coefficient = rest._explained(self.held(entry.suspect))
+                explained, coefficient = rest._explained_share(self.held(entry.suspect))
                 found.append(replace(entry, explained=explained, coefficient_found=coefficient))
         return found
 
     def held(self, suspect: MotionSuspect) -> Matrix:
         """Return a term that the learner sees (M, nl), weighed."""
-        return self.weighed(self._rows(suspect, suspect.place(self.motion)))
+        return self.weigh(self._rows(suspect, suspect.place(self.motion)))
 
     def physics_cosine(self, suspect: MotionSuspect) -> float:
         """Return the cosine between a term that the learner sees and the shared directions."""
@@ -278,21 +280,21 @@ class MotionLinearization:
             else 0.0
         )
 
-    def seen_entry(self, suspect: MotionSuspect) -> TermBias:
+    def entry_without_run(self, suspect: MotionSuspect) -> TermBias:
         """Return the bias by a term that the learner sees, by the measure without the free run."""
         motion, held = self.motion, self.held(suspect)
         moved = self.phi.solve_along(held, self.shared.basis)
         moved = np.where(np.isin(motion.names, self.unknown), np.nan, moved)
-        explained, found = self._explained(held)
+        explained, found = self._explained_share(held)
         coordinates = motion.coordinates
         value, per_unit = coordinates.physical(self.q), coordinates.slopes(self.q) * moved
         equation, size = equations_of(motion)[suspect.place(motion)], float(np.linalg.norm(held))
         own = (suspect, equation, motion.names, moved, per_unit, value, None)
         return TermBias(*own, None, size, True, explained, found, None, None)
 
-    def learned_beside(self) -> Matrix:
+    def unshared_learner(self) -> Matrix:
         """Return the learner (M, nl), weighed, beside the shared directions."""
-        return self.beside(self.weighed(np.asarray(self.learned)))
+        return self.beside(self.weigh(np.asarray(self.learned)))
 
     def beside(self, values: Matrix) -> Matrix:
         """Return the part of weighted values (M, nl) outside the shared directions."""
@@ -314,14 +316,14 @@ class MotionLinearization:
             )
         return np.where(np.isfinite(rows), rows, 0.0)
 
-    def _explained(self, held: Matrix) -> tuple[float | None, float | None]:
+    def _explained_share(self, held: Matrix) -> tuple[float | None, float | None]:
         """Return the share of the learner that a term explains, and its coefficient.
 
         Both are taken beside the shared directions.
         """
         if self.learned is None:
             return None, None
-        rest, tilde, size = self.beside(held), self.learned_beside(), np.linalg.norm(held)
+        rest, tilde, size = self.beside(held), self.unshared_learner(), np.linalg.norm(held)
         norm = np.linalg.norm(rest)
         if not np.any(tilde) or norm <= IN_SPAN * size:
             return None, None
@@ -418,7 +420,7 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
     if fit.model.form.bound is None:
         return []
     field = fit.split_by.field
-    smooth = softened(suspects, fit.problem.motion, fit.values, field.x, field.u)
+    smooth = soften_jumps(suspects, fit.problem.motion, fit.values, field.x, field.u)
     return suspected_bias(fit, smooth) if smooth else []
 
 
@@ -432,7 +434,7 @@ def usual_biases(fit: MotionEstimate) -> tuple[list[TermBias], list[TermBias]]:
     if linearization is None or not linearization.learns or not fit.shared.basis.shape[1]:
         return [], []
     seen = [suspect for suspect in linearization.usual() if linearization.sees(suspect)]
-    smooth = softened(
+    smooth = soften_jumps(
         seen, fit.problem.motion, fit.values, linearization.field.x, linearization.field.u
     )
     table = linearization.table((*seen, *smooth))  # one program for all
@@ -472,13 +474,13 @@ def linearize_physics(task: MotionTask, structure: Structure) -> MotionLineariza
     place = FreeRunPoint(
         segmented, point.theta, weights, point.states, task.physics.objective.weight
     )
-    none = MotionSplit.none("training", form, point.theta)
+    none = MotionSplit.empty("training", form, point.theta)
     if segmented.bound is None:
         return MotionLinearization(place, point.theta, none.shared, none.field)
     field = field_under(
         structure.measure,
-        segmented.alone,
-        segmented.alone.numbers(point.theta, weights),
+        segmented.physics_only,
+        segmented.physics_only.numbers(point.theta, weights),
         point.states,
     )[0]
     if structure.shared == "all":

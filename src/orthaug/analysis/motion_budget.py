@@ -117,7 +117,7 @@ def families_of(linearization: MotionLinearization) -> list[TermBias]:
     terms = motion_catalogue(
         motion, motion.coordinates.physical(linearization.q), field.x, field.u, on
     )
-    entries = [linearization.seen_entry(term) for term in terms if linearization.sees(term)]
+    entries = [linearization.entry_without_run(term) for term in terms if linearization.sees(term)]
     return [
         entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
     ]
@@ -128,10 +128,9 @@ def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> floa
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(linearization.learned_beside() ** 2)
+    own = np.sum(linearization.unshared_learner() ** 2)
     return float(
-        np.sum(linearization.weighed(half / reach(fit.freedom)) ** 2)
-        / max(own, np.finfo(float).tiny)
+        np.sum(linearization.weigh(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny)
     )
 
 
@@ -169,7 +168,9 @@ def motion_budget(
     name = " and ".join(cause.suspect.name for cause in causes)
     candidates = [NamedCause(name, found.share, bias, rest=np.linalg.norm(found.unsure, axis=0))]
     candidates += (
-        _instead(fit, (*table, *smooth, *families), own) if learns and len(causes) == 1 else []
+        _rival_candidates(fit, (*table, *smooth, *families), own)
+        if learns and len(causes) == 1
+        else []
     )
     ends = hull(value, std, fit.freedom, candidates)
     parameters = fit.problem.motion.parameters
@@ -184,14 +185,16 @@ def motion_budget(
     return MotionBudget(causes, found.share, rows, tuple(warnings))
 
 
-def _instead(
+def _rival_candidates(
     fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]
 ) -> list[Candidate]:
     """Return the rivals of the named cause."""
     linearization = linearize_fit(fit)
     assert linearization is not None
     likely = [
-        Candidate(entry.suspect.name, explains(entry), _moved(entry), entry.suspect in declared)
+        Candidate(
+            entry.suspect.name, explains(entry), _parameter_shift(entry), entry.suspect in declared
+        )
         for entry in table
         if entry.seen
         and entry.explained
@@ -234,7 +237,7 @@ def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
     return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
-def _moved(entry: TermBias) -> Vector:
+def _parameter_shift(entry: TermBias) -> Vector:
     """Return the parameters moved by a term of the size found."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
@@ -271,7 +274,7 @@ def _of_learner(
         )  # as much of what the others leave as one must explain of all
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
             alone, share = each, joint
-    return None if share < LEAST_SHARE else _weighed(linearization, alone, share, every)
+    return None if share < LEAST_SHARE else _weigh_causes(linearization, alone, share, every)
 
 
 def one_of_each(
@@ -291,13 +294,13 @@ def one_of_each(
         return []
     values = (
         *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
-        linearization.learned_beside(),
+        linearization.unshared_learner(),
     )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
     cosines = (rows @ rows.T) / np.outer(sizes, sizes)
 
-    def beside(others: list[int]) -> tuple[Vector, Vector]:
+    def explain_beside(others: list[int]) -> tuple[Vector, Vector]:
         """Return the share of the learner that others explain with each term, and coefficients."""
         rest = (
             cosines
@@ -311,13 +314,13 @@ def one_of_each(
         """Return the best term of each equation beside the others, iterated from a first term."""
         now, share = [first], 0.0
         for k in (*range(1, len(groups)), *range(len(groups)), *range(len(groups))):
-            shares = beside(now[:k] + now[k + 1 :])[0][groups[k]]
+            shares = explain_beside(now[:k] + now[k + 1 :])[0][groups[k]]
             now[k : k + 1], share = [int(groups[k][np.argmax(shares)])], float(np.max(shares))
         return share, now
 
     chosen, found = max(best_from(first) for first in groups[0].tolist())[1], []
     for k, group in enumerate(groups):
-        shares, fitted = beside(chosen[:k] + chosen[k + 1 :])
+        shares, fitted = explain_beside(chosen[:k] + chosen[k + 1 :])
         members = [
             replace(seen[i], explained=float(shares[i]), coefficient_found=float(fitted[i]))
             for i in group
@@ -326,7 +329,7 @@ def one_of_each(
     return found
 
 
-def _weighed(
+def _weigh_causes(
     linearization: MotionLinearization | None,
     each: Sequence[Sequence[TermBias]],
     share: float,
@@ -338,11 +341,11 @@ def _weighed(
         each: of an equation, or of all, its cause and then what may be it instead.
     """
     causes = tuple(entries[0] for entries in each)
-    bias, rivals = np.sum([_moved(cause) for cause in causes], axis=0), []
+    bias, rivals = np.sum([_parameter_shift(cause) for cause in causes], axis=0), []
     unsure = [np.sqrt((1 - share) / share) * bias]
     for cause, *others in each:
         near = rivals_of(cause, others)
-        apart = [np.abs(_moved(rival) - _moved(cause)) for rival in near]
+        apart = [np.abs(_parameter_shift(rival) - _parameter_shift(cause)) for rival in near]
         if len(each) > 1:  # of a single cause they are in the hull
             unsure.append(np.max([np.zeros(len(bias)), *apart], axis=0))
         rivals += [
@@ -351,7 +354,7 @@ def _weighed(
             if np.any(by > _ELSEWHERE * np.abs(bias))
         ]
     after = [] if linearization is None else linearization.after(causes, table)
-    unsure += [_moved(max(after, key=explains))] if after else []
+    unsure += [_parameter_shift(max(after, key=explains))] if after else []
     return _Causes(causes, share, bias, np.array(unsure), tuple(rivals))
 
 

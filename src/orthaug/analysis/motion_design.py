@@ -22,13 +22,13 @@ from orthaug.analysis.design import (
     check_no_memory,
     check_samples,
     input_limits,
-    searched,
+    search_input,
     set_known,
 )
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
-from orthaug.models.integrators import held
+from orthaug.models.integrators import inputs_at_points
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.suspected_motion import SuspectedMotion
@@ -115,7 +115,10 @@ class MotionPlant:
             [{self.channel: padded, **signals}[name] for name in motion.inputs], axis=1
         )
         read = np.stack(
-            [held(one, motion.hold, self._form.substeps) for one in np.moveaxis(together, -1, 0)],
+            [
+                inputs_at_points(one, motion.hold, self._form.substeps)
+                for one in np.moveaxis(together, -1, 0)
+            ],
             axis=-1,
         )
         start = np.repeat(self.before[:, None], _WIDTH, axis=1)
@@ -134,10 +137,10 @@ class MotionPlant:
             [slopes[..., nx : nx + nt] / self._slopes, missing[..., None]], axis=-1
         )
         deviation = np.where(sound, np.where(sound, values, 0.0).std(axis=0), 1.0).T
-        return _without(slopes[..., :nx], rows), deviation
+        return _remove_starts(slopes[..., :nx], rows), deviation
 
 
-def _without(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _remove_starts(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return rows (m, N, ny, k) less the effect of unknown starts (m, N, ny, nx)."""
     shape, flat = rows.shape, start.reshape(len(start), -1, start.shape[-1])
     size = np.linalg.norm(flat, axis=1, keepdims=True)
@@ -156,7 +159,7 @@ def _run(
     inputs: Float[Array, "T nu m"],
 ) -> tuple[Float[Array, "T ny m"], Float[Array, "T ny n m"]]:
     """Return outputs of every run, and their sensitivities to start and coordinates."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
 
     def step(carry: Any, row: Any) -> Any:
         state, slopes = carry
@@ -226,6 +229,6 @@ def design_motion_input(
     plant = MotionPlant(motion, suspects, p, sampling_time, steps, channel)
     samples = check_samples(samples, plant)
     set_known(plant, known_inputs, samples)
-    return searched(
+    return search_input(
         plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations)
     )

@@ -68,7 +68,9 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     white = all(test.practically_white() for test in tests)
     size = rms_errors(free_run) / fit.problem.deviation
     late = (
-        _late(fit) if motion.inputs and (explained or not white) and np.any(size > _SIZABLE) else ()
+        _dead_times(fit)
+        if motion.inputs and (explained or not white) and np.any(size > _SIZABLE)
+        else ()
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = _words(verdict, fit, tests, shares, followed, curved, lacks, late)
@@ -76,12 +78,14 @@ def diagnose_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None
     warnings += (
         []
         if white
-        else [Warning("coloured_residual", _coloured(fit) + (_UNCOUNTED if explained else ""))]
+        else [
+            Warning("coloured_residual", _colour_sentence(fit) + (_UNCOUNTED if explained else ""))
+        ]
     )
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
-def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
+def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     """Return the inputs that act later, by the physics trained before the learner.
 
     It runs in the same compiled programs.
@@ -91,7 +95,7 @@ def _late(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
-def _coloured(fit: MotionEstimate) -> str:
+def _colour_sentence(fit: MotionEstimate) -> str:
     """Return a sentence on coloured errors, and on the standard errors that follow."""
     text = "the errors of the free run are coloured: judge the model by held-out errors"
     if fit.std is None or fit.plain_covariance is not None:
@@ -156,7 +160,7 @@ def _words(
             f"{late[0].input} acts later than in the equations: {late[0].gain}."
         )
     if lacks is not None:
-        return f"The free run's error ({sizes}) holds more than noise. {_named(lacks)}"
+        return f"The free run's error ({sizes}) holds more than noise. {_name_terms(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} is not flat over {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
@@ -202,7 +206,7 @@ def _colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) ->
     return "; ".join(clauses)
 
 
-def _named(lacks: MissingTest) -> str:
+def _name_terms(lacks: MissingTest) -> str:
     """Return the terms that are most likely missing."""
     best, *others = lacks.terms
     text = f"Most likely {best} would explain {percent(best.share)} of its square"

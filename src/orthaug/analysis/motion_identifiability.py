@@ -47,12 +47,12 @@ class RankReport:
     inputs: Matrix
 
 
-def identified(segmented: SegmentedMotion) -> RankReport | None:
+def identify_ranks(segmented: SegmentedMotion) -> RankReport | None:
     """Return the ranks of the physics without a learner, over shorter segments where runs diverge.
 
     None where no run is finite.
     """
-    segmented = segmented.alone
+    segmented = segmented.physics_only
     steps = segmented.segments.steps
     for shorter_runs in (
         segmented,
@@ -82,7 +82,7 @@ def _rank(segmented: SegmentedMotion) -> Excitation | None:
     as if b alone were idle.
     """
     best: Excitation | None = None
-    for q in _near(segmented):
+    for q in _nearby_values(segmented):
         gram = information(segmented, q)
         if gram is not None:
             found = of_gram(gram, segmented.problem.motion.names)
@@ -116,7 +116,7 @@ def ill_conditioned_alone(task: MotionTask) -> list[Warning]:
 
     None where it has no run.
     """
-    free_fit, segmented = task.physics, task.plan.alone
+    free_fit, segmented = task.physics, task.plan.physics_only
     if free_fit is None or not free_fit.ending.usable:
         return []
     q = free_fit.end.point.theta
@@ -129,7 +129,7 @@ def ill_conditioned_alone(task: MotionTask) -> list[Warning]:
     )
 
 
-def _near(segmented: SegmentedMotion) -> Iterator[Vector]:
+def _nearby_values(segmented: SegmentedMotion) -> Iterator[Vector]:
     coordinates, random = segmented.problem.motion.coordinates, np.random.default_rng(_SEED)
     low, high = coordinates.bounds
     first = coordinates.initial
@@ -154,13 +154,13 @@ def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
         for column in inputs.T:
             column[:] = _levels(len(column), random)
         experiments.append(replace(experiment, inputs=(low + high) / 2 + half * inputs))
-    excited = _on(segmented, replace(record, experiments=tuple(experiments)))
+    excited = _with_record(segmented, replace(record, experiments=tuple(experiments)))
     start = np.asarray(excited.segments.start)
     size = np.abs(start).max(axis=(0, 2), keepdims=True)
     return excited.from_states(start + _NEAR * size * random.normal(size=start.shape))
 
 
-def _on(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
+def _with_record(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
     """Return the same segments on another record."""
     whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
     return (

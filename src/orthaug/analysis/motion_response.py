@@ -99,7 +99,7 @@ class TermsResponse:
         free = self.fitted.copy()
         free[: self.parameters] &= ~apart
         found = np.zeros(len(free))
-        found[free] = solved(
+        found[free] = solve_scaled(
             self.penalised[np.ix_(free, free)], self.information[free, self.parameters + k]
         )
         return found[: self.parameters], found[self.parameters + self.terms :]
@@ -113,7 +113,7 @@ class TermsResponse:
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
         """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
-        return np.asarray(_along(self.form, self.numbers, dw, x, u))
+        return np.asarray(_learned_change(self.form, self.numbers, dw, x, u))
 
     def cosine(self, k: int) -> float | None:
         """Return the share of the term's effect on the outputs that the fit takes up, in [0, 1].
@@ -121,7 +121,11 @@ class TermsResponse:
         None where it has none.
         """
         own = self.information[self.parameters + k, self.parameters + k]
-        return float(np.sqrt(np.clip(1 - self._beside(k)[1] / own, 0.0, 1.0))) if own > 0 else None
+        return (
+            float(np.sqrt(np.clip(1 - self._remaining_information(k)[1] / own, 0.0, 1.0)))
+            if own > 0
+            else None
+        )
 
     def size(self, k: int) -> float:
         """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
@@ -136,7 +140,7 @@ class TermsResponse:
 
         None where the fit could hold the term as well.
         """
-        row, left = self._beside(k)
+        row, left = self._remaining_information(k)
         if not left > ALIKE * self.information[self.parameters + k, self.parameters + k]:
             return None
         pulled = np.zeros(len(row))
@@ -169,13 +173,13 @@ class TermsResponse:
         made = (self.form, self.numbers, self.segments, place.states, place.weight)
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
-    def _beside(self, k: int) -> tuple[Vector, float]:
+    def _remaining_information(self, k: int) -> tuple[Vector, float]:
         """Return the row (n,) that removes the fit from the term, and the remaining information."""
         i = self.parameters + k
         row = np.zeros(len(self.fitted))
         row[i] = 1.0
         across = self.information[self.fitted, i]
-        row[self.fitted] = -solved(self.penalised[np.ix_(self.fitted, self.fitted)], across)
+        row[self.fitted] = -solve_scaled(self.penalised[np.ix_(self.fitted, self.fitted)], across)
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
@@ -216,7 +220,7 @@ def _signals(place: FreeRunPoint, added: Sequence[SuspectedTerm]) -> list[Matrix
     ]
 
 
-def solved(matrix: Matrix, right: Vector) -> Vector:
+def solve_scaled(matrix: Matrix, right: Vector) -> Vector:
     """Return least squares with unit columns; unknowns without information stay 0."""
     if not len(matrix):
         return np.zeros(0)
@@ -228,17 +232,17 @@ def solved(matrix: Matrix, right: Vector) -> Vector:
 
 
 @partial(jax.jit, static_argnames="form")
-def _along(
+def _learned_change(
     form: MotionDynamics,
     numbers: Numbers,
     dw: Float[Array, "nw"],
     x: Float[Array, "m nx"],
     u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
-    def learned(w: Any) -> Any:
+    def learned_output(w: Any) -> Any:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
 
-    return jax.jvp(learned, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]
+    return jax.jvp(learned_output, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,7 +283,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     ):
         return None
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
-    finer = segmented.refined(2 * substeps)
+    finer = segmented.with_substeps(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
     moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
     slopes = sensitivity(
@@ -296,7 +300,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w])
     )
     step = np.zeros(len(free))
-    step[free] = solved(information[np.ix_(free, free)], gradient[free])
+    step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
     std = np.full(len(c), np.nan) if fit.std is None else fit.std
     errors = np.abs(value) / np.where(std > 0, std, np.nan)
@@ -318,10 +322,8 @@ def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:
             and name not in fit.unidentified
             and abs(moved) > _LARGE_SHARE * abs(value)
         ):
-            shifts.append(
-                f"{name} by "
-                f"{moved:+.2g}{share.replace(',', ' (', 1).replace('( ', '(')}{')' if share else ''}"
-            )
+            per_cent = share.replace(",", " (", 1).replace("( ", "(") + (")" if share else "")
+            shifts.append(f"{name} by {moved:+.2g}{per_cent}")
     if not shifts:
         return ()
     steps = f"{found.substeps} substep{'s' * (found.substeps > 1)} in a sample"

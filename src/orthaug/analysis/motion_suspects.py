@@ -21,7 +21,7 @@ from orthaug.analysis.suspects import (
     check_coefficient,
     check_name,
     memory_of,
-    written,
+    suspect_text,
 )
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
@@ -54,7 +54,8 @@ class MotionSuspect:
     may be left out where one state is learned, or only one equation has parameters.
 
     Examples:
-        >>> MotionSuspect.of("coulomb", "v", factor="-1/m", equation="v", coefficient=1.5, unit="N").expression
+        >>> force = {"factor": "-1/m", "equation": "v", "coefficient": 1.5, "unit": "N"}
+        >>> MotionSuspect.of("coulomb", "v", **force).expression
         '(-1/m)*(sign(v))'
     """
 
@@ -103,10 +104,10 @@ class MotionSuspect:
             InputError: an unknown kind, an argument that is missing, or that the kind does not
                 take.
         """
-        text, label, _ = written(kind, on, width, _balanced, "v", time_constant)
+        text, label, _ = suspect_text(kind, on, width, _check_parentheses, "v", time_constant)
         memory = memory_of(kind, on, width, time_constant)
         if factor is not None:
-            _balanced(factor)
+            _check_parentheses(factor)
             label = f"{factor} * {label}"
             text = text if memory is not None else f"({factor})*({text})"
         if memory is not None:
@@ -182,7 +183,7 @@ def usual_places(motion: Motion) -> tuple[int, ...]:
 
 def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
     """Raise InputError for suspects that the motion cannot have, or without a value somewhere."""
-    motion, (x, u) = problem.motion, problem.looked_at
+    motion, (x, u) = problem.motion, problem.guessed_points
     check_unique((suspect.name for suspect in suspects), "suspect")
     for suspect in suspects:
         suspect.place(motion)
@@ -213,7 +214,7 @@ def motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
     return float(f"{np.median(size[size > 0]):.6g}")
 
 
-def _balanced(text: str) -> None:
+def _check_parentheses(text: str) -> None:
     """Raise InputError where parentheses are no pairs: names are checked with the motion."""
     depth = 0
     for letter in text:
@@ -226,7 +227,7 @@ def _balanced(text: str) -> None:
         )
 
 
-def softened(
+def soften_jumps(
     suspects: Sequence[MotionSuspect], motion: Motion, p: Vector, x: Matrix, u: Matrix
 ) -> tuple[MotionSuspect, ...]:
     """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.

@@ -119,11 +119,13 @@ class Observations:
         }
         for i, channel in enumerate(self.outputs):
             columns[channel.name] = one.measured[:, i]
-            columns |= _banded(f"{channel.name}_model", one.outputs[:, i], one.outputs_std[:, i])
+            columns |= _band_columns(
+                f"{channel.name}_model", one.outputs[:, i], one.outputs_std[:, i]
+            )
         for i, name in enumerate(self.state_names):
-            columns |= _banded(f"state:{name}", one.states[:, i], one.states_std[:, i])
+            columns |= _band_columns(f"state:{name}", one.states[:, i], one.states_std[:, i])
         return pd.DataFrame(columns)
 
 
-def _banded(name: str, value: Vector, std: Vector) -> dict[str, Vector]:
+def _band_columns(name: str, value: Vector, std: Vector) -> dict[str, Vector]:
     return {name: value, f"{name}_low": value - BAND * std, f"{name}_high": value + BAND * std}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count, check_type
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug.analysis.observed import Observations, ObserverRun
 from orthaug.analysis.observer_noise import by_verdict, most_likely, of_fit
 from orthaug.data.record import Experiment, Record
@@ -19,9 +19,9 @@ from orthaug.models.kalman import (
     FilterRow,
     Noise,
     StateEstimate,
-    ahead,
-    filtered,
     one_row,
+    predict_outputs,
+    run_filter,
     spread_of,
 )
 from orthaug.models.model import Model
@@ -68,7 +68,7 @@ class Observer:
             noise = by_verdict(model) if fit is None else of_fit(fit)
         object.__setattr__(self, "model", model)
         object.__setattr__(
-            self, "noise", _checked(noise, model.filtering[0].disturbances, len(model.outputs))
+            self, "noise", _check_noise(noise, model.filtering[0].disturbances, len(model.outputs))
         )
 
     def __repr__(self) -> str:
@@ -109,10 +109,10 @@ class Observer:
             InputError: other channels, too few rows, or an estimate that leaves all bounds.
         """
         record = self._record(record)
-        runs = tuple(self._along(experiment, record)[0] for experiment in record.experiments)
+        runs = tuple(self._run_along(experiment, record)[0] for experiment in record.experiments)
         form = self.model.filtering[0]
         names = form.names if form.hidden else ()
-        return Observations(runs, self.model.outputs, names, record.sampling_time, self._settled)
+        return Observations(runs, self.model.outputs, names, record.sampling_time, self._start_rows)
 
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Return the prediction of each row from `horizon` samples before it, with its deviation.
@@ -126,12 +126,12 @@ class Observer:
         horizon = check_count(horizon, "horizon", of="steps")
         record = self._record(record)
         trajectories = [
-            self._ahead(experiment, record, horizon) for experiment in record.experiments
+            self._predict_ahead(experiment, record, horizon) for experiment in record.experiments
         ]
         return Response(tuple(trajectories), horizon, self.model.outputs, record.sampling_time)
 
     @property
-    def _settled(self) -> int:
+    def _start_rows(self) -> int:
         """Rows that determine the start of an experiment."""
         form = self.model.filtering[0]
         return self.model.window if form.hidden else form.first_row
@@ -139,7 +139,7 @@ class Observer:
     def _record(self, record: Record) -> Record:
         return self.model.fitting(record, need_outputs=True, gaps=True)
 
-    def _along(
+    def _run_along(
         self, experiment: Experiment, record: Record
     ) -> tuple[ObserverRun, StateEstimate, Matrix]:
         """Return the observed run of an experiment, the predicted states, and the steps' inputs."""
@@ -148,7 +148,7 @@ class Observer:
         self.model.check_rows(experiment, first)
         begun = form.start(experiment, record, first, self.noise, size)
         inputs = form.inputs(experiment, record)
-        before, rows = filtered(
+        before, rows = run_filter(
             form, numbers, self.noise, begun, inputs, experiment.outputs[first:]
         )
         finite = np.isfinite(rows.predicted).all(axis=1) & np.isfinite(before.state).all(axis=1)
@@ -158,19 +158,19 @@ class Observer:
                 "bounds there; the model does not hold on this record, or the noise of the "
                 "observer is wrong."
             )
-        return _observed(rows, experiment, first), before, inputs
+        return _fill_unestimated(rows, experiment, first), before, inputs
 
-    def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
+    def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         form, numbers, _ = self.model.filtering
-        first = max(form.first_row, min(self._settled, len(experiment) - horizon)) + horizon - 1
+        first = max(form.first_row, min(self._start_rows, len(experiment) - horizon)) + horizon - 1
         self.model.check_rows(experiment, first)
-        _, before, inputs = self._along(experiment, record)
-        parts, std = ahead(form, numbers, self.noise, before, inputs, horizon)
+        _, before, inputs = self._run_along(experiment, record)
+        parts, std = predict_outputs(form, numbers, self.noise, before, inputs, horizon)
         if form.hidden:
-            alone = self.model.alone.filtering
+            alone = self.model.physics_only.filtering
             known = parts
             if self.model.form.bound is not None:
-                known = ahead(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
+                known = predict_outputs(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1
         predicted = trajectory(
@@ -188,7 +188,8 @@ class ObserverState:
     Examples:
         >>> import numpy as np, orthaug as oa
         >>> u = np.sin(np.arange(200.0))
-        >>> y = np.convolve(u, 0.5 ** np.arange(20))[:200] + 0.01 * np.random.default_rng(0).normal(size=200)
+        >>> noise = 0.01 * np.random.default_rng(0).normal(size=200)
+        >>> y = np.convolve(u, 0.5 ** np.arange(20))[:200] + noise
         >>> record = oa.Record.from_arrays(u, y)
         >>> baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k]")])
         >>> now = oa.Observer(oa.estimate(record, baseline, learner=None)).start(record)
@@ -282,7 +283,7 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     try:
         row = np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"`{name}` must be a vector of numbers; got {shown(values)}.") from None
+        raise InputError(f"`{name}` must be a vector of numbers; got {show(values)}.") from None
     if row.shape != (count,):
         raise InputError(f"`{name}` must have {count} numbers; got the shape {row.shape}.")
     if np.isinf(row).any() or (not gaps and np.isnan(row).any()):
@@ -293,32 +294,32 @@ def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
     return row
 
 
-def _observed(rows: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
+def _fill_unestimated(rows: FilterRow, experiment: Experiment, first: int) -> ObserverRun:
     """Return the run, with NaN before the first row that is estimated."""
 
-    def whole(values: Any) -> Any:
+    def pad_rows(values: Any) -> Any:
         return np.concatenate([np.full((first, *values.shape[1:]), np.nan), values])
 
     return ObserverRun(
         measured=experiment.outputs,
-        predicted=whole(rows.predicted),
-        spread=whole(rows.spread),
-        outputs=whole(rows.outputs),
-        outputs_std=whole(spread_of(rows.outputs_covariance)),
-        states=whole(rows.state),
-        states_std=whole(spread_of(rows.state_covariance)),
-        square=whole(rows.square),
+        predicted=pad_rows(rows.predicted),
+        spread=pad_rows(rows.spread),
+        outputs=pad_rows(rows.outputs),
+        outputs_std=pad_rows(spread_of(rows.outputs_covariance)),
+        states=pad_rows(rows.state),
+        states_std=pad_rows(spread_of(rows.state_covariance)),
+        square=pad_rows(rows.square),
         start=first,
         start_time=experiment.start_time,
     )
 
 
-def _checked(noise: Any, disturbances: int, outputs: int) -> Noise:
+def _check_noise(noise: Any, disturbances: int, outputs: int) -> Noise:
     """Return two covariances; raises InputError for anything else."""
     sizes = {"state": disturbances, "output": outputs}
     if not isinstance(noise, Noise):
         raise InputError(
-            f"`noise` must be an oa.Noise(state, output) of two covariances; got {shown(noise)}."
+            f"`noise` must be an oa.Noise(state, output) of two covariances; got {show(noise)}."
         )
     parts = []
     for (name, size), given in zip(sizes.items(), noise, strict=True):

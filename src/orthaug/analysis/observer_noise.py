@@ -47,7 +47,7 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     kept = model.statistics
     if verdict is None and kept.disturbance is not None and kept.sensor is not None:
         return Noise(kept.disturbance, kept.sensor)
-    if not _known(kept.noise):
+    if not _is_known(kept.noise):
         raise InputError(
             "the model has no estimate of its noise (few rows, or trained elsewhere); give the "
             "observer `noise=`, such as oa.Noise(state, output) with two covariances."
@@ -58,7 +58,7 @@ def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
     return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
 
 
-def _known(noise: Matrix | None) -> TypeGuard[Matrix]:
+def _is_known(noise: Matrix | None) -> TypeGuard[Matrix]:
     return noise is not None and bool(np.all(np.diag(noise) > 0))
 
 
@@ -107,7 +107,7 @@ def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
     """
     model, kept = fit.model, fit.model.statistics
     if (
-        not _known(kept.noise)
+        not _is_known(kept.noise)
         or not kept.simulated
         or verdict not in BOTH
         or not model.form.differentiable

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, is_number, nearest
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, show
 from orthaug.analysis.linear_steps import Step, at_rest, difference_widths, sizes_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
@@ -41,7 +41,7 @@ class Slopes:
     outputs: tuple[int, ...]
     """Numbers of the outputs whose values are equations too."""
 
-    def following(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
+    def follow(self, change: Float[np.ndarray, "m r"]) -> Float[np.ndarray, "k r"]:
         """Return the change of (rest, inputs) by changed equations (implicit function theorem)."""
         moved = np.zeros((len(self.free), change.shape[1]))
         if self.free.any():
@@ -89,11 +89,11 @@ def parse_point(at: str | Mapping[str, float] | None) -> dict[str, float]:
         at = given
     wanted = 'names with finite numbers, such as "force=0, position=1"'
     if not isinstance(at, Mapping):
-        raise InputError(f"the operating point must be {wanted}; got {shown(at)}.")
+        raise InputError(f"the operating point must be {wanted}; got {show(at)}.")
     for name, value in at.items():
         if not isinstance(name, str) or not name or not is_number(value):
             raise InputError(
-                f"the operating point must be {wanted}; got {shown(name)} = {shown(value)}."
+                f"the operating point must be {wanted}; got {show(name)} = {show(value)}."
             )
     return {name: float(value) for name, value in at.items()}
 
@@ -149,7 +149,7 @@ class Search:
                 known = list(dict.fromkeys((*step.inputs, *step.rest, *outputs)))
                 hint = nearest(name, known)
                 raise InputError(
-                    f"the model has no '{shown(name)[1:-1]}'{hint}; known are {', '.join(known)}."
+                    f"the model has no '{show(name)[1:-1]}'{hint}; known are {', '.join(known)}."
                 )
         ne = len(step.rest)
         trims = bool(wanted) or bool(np.isfinite(given[:ne]).any())
@@ -207,20 +207,22 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
     unit = np.where(unit > 0, unit, 1.0)
     found: list[OperatingPoint] = []
     for start in starts:
-        point = _solved(search, start, unit)
+        point = _solve_rest(search, start, unit)
         if point is None:
             continue
         one = _point(search, point)
         near = [
-            np.abs((_whole(other) - point) / search.scale).max(initial=0.0) < _SAME
+            np.abs((_join_unknowns(other) - point) / search.scale).max(initial=0.0) < _SAME
             for other in found
         ]
         if any(near) or (one.line and any(other.line for other in found)):
             continue
         found.append(one)
     if not found:
-        raise InputError(_nothing(search, starts, unit))
-    found.sort(key=lambda one: float(np.linalg.norm((_whole(one) - search.middle) / search.scale)))
+        raise InputError(_reason_for_none(search, starts, unit))
+    found.sort(
+        key=lambda one: float(np.linalg.norm((_join_unknowns(one) - search.middle) / search.scale))
+    )
     return _within_reach(search, found)
 
 
@@ -255,11 +257,11 @@ def _within_reach(
     return near, warnings
 
 
-def _whole(point: OperatingPoint) -> Vector:
+def _join_unknowns(point: OperatingPoint) -> Vector:
     return np.concatenate([point.rest, point.inputs])
 
 
-def _solved(search: Search, start: Vector, unit: Vector) -> Vector | None:
+def _solve_rest(search: Search, start: Vector, unit: Vector) -> Vector | None:
     """Return the point of rest that a start leads to; None where it leads nowhere."""
     from scipy.optimize import least_squares  # slow to import
 
@@ -309,7 +311,7 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     )
 
 
-def _nothing(search: Search, starts: Matrix, unit: Vector) -> str:
+def _reason_for_none(search: Search, starts: Matrix, unit: Vector) -> str:
     """Return the reason why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
     fixed = [

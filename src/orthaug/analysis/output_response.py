@@ -104,7 +104,7 @@ def _linearize(
 ) -> LinearRun | None:
     count = len(rows)
     padded = np.pad(rows, ((0, padded_length(count) - count), (0, 0)), mode="edge")
-    found = [np.asarray(part)[:count] for part in _along(form, numbers, start, padded)]
+    found = [np.asarray(part)[:count] for part in _linearise_run(form, numbers, start, padded)]
     states, run, a, c, b, d = found
     if not all(
         np.isfinite(part).all() and np.abs(part).max(initial=0.0) < LARGEST
@@ -116,14 +116,14 @@ def _linearize(
 
 
 @partial(jax.jit, static_argnames="form")
-def _along(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
+def _linearise_run(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
     """Return states, outputs, and the slopes of both, at every row of a free run.
 
     The slopes are those by state and parameters.
     """
 
     def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
-        own = form.prepared(numbers._replace(theta=theta))
+        own = form.prepare(numbers._replace(theta=theta))
         following, parts = form.step(own, state, row)
         return following, parts.total
 

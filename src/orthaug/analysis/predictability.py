@@ -116,9 +116,11 @@ class BlockSums:
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
         """Return the share of the target that `columns` explain beyond those in `beside`."""
-        return Share.of(self._missed(list(beside)), self._missed([*beside, *columns]))
+        return Share.of(
+            self._squared_errors(list(beside)), self._squared_errors([*beside, *columns])
+        )
 
-    def _missed(self, columns: list[int]) -> Vector:
+    def _squared_errors(self, columns: list[int]) -> Vector:
         """Return each block's sum of squared errors (blocks,), by regression on the others."""
         own = np.ix_(range(len(self.grams)), columns, columns)
         inner, moment, total = self.grams[own], self.grams[:, columns, -1], self.grams[:, -1, -1]

@@ -25,7 +25,7 @@ from orthaug.analysis.whiteness import (
     ljung_box,
     ljung_box_of,
     normality,
-    whitening,
+    whitening_filter,
 )
 from orthaug.data.record import Experiment
 from orthaug.models.response import Response
@@ -152,7 +152,7 @@ def _one_output(
 ) -> ResidualTest:
     whole = np.concatenate(e)
     n, finite = len(whole), len(whole) > 0 and bool(np.abs(whole).max() < LARGEST)
-    acf, box, a = autocorrelation(e, lags), ljung_box(e, lags, fitted), whitening(e, lags)
+    acf, box, a = autocorrelation(e, lags), ljung_box(e, lags, fitted), whitening_filter(e, lags)
     cross = {key: against_input(e, u, lags, level=level, a=a) for key, u in inputs.items()}
     curves = {key: against_regressor(e, x, centred=True, a=a) for key, x in regressors.items()}
     return ResidualTest(
@@ -167,9 +167,9 @@ def _one_output(
         white=None if box is None else box.p >= level,
         order=None if a is None else len(a) - 1,
         cross=cross,
-        correlated_inputs=_rejected(cross, level),
+        correlated_inputs=_rejected_tests(cross, level),
         regressors=curves,
-        curved_regressors=_rejected(curves, level),
+        curved_regressors=_rejected_tests(curves, level),
         normality=None
         if a is None
         else normality([np.convolve(one, a, "valid") for one in e if len(one) >= len(a)]),
@@ -183,7 +183,7 @@ def _one_output(
     )
 
 
-def _rejected(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
+def _rejected_tests(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
     p = {name: test.p for name, test in tests.items() if test is not None and test.p is not None}
     return tuple(name for name, value in p.items() if value < level / len(p))
 

@@ -132,7 +132,7 @@ def prbs(samples: int, *, amplitude: float, hold: int = 1, bits: int | None = No
             "or a hold."
         )
     sequence = scipy.signal.max_len_seq(bits)[0]
-    return amplitude * _held(np.resize(sequence, length), hold, samples)
+    return amplitude * _hold_bits(np.resize(sequence, length), hold, samples)
 
 
 def swept_sine(
@@ -218,7 +218,7 @@ def binary_pattern(
         or not np.isin(levels, (0, 1)).all()
     ):
         raise InputError(f"`pattern` must be a sequence of 0 and 1; got {pattern!r}.")
-    return amplitude * _held(np.resize(levels, -(-samples // hold)), hold, samples)
+    return amplitude * _hold_bits(np.resize(levels, -(-samples // hold)), hold, samples)
 
 
 def white_gaussian(
@@ -262,7 +262,9 @@ def white_binary(samples: int, *, amplitude: float, seed: int, hold: int = 1) ->
         check_count(samples, "samples"),
         check_count(hold, "hold"),
     )
-    return amplitude * _held(_generator(seed).integers(0, 2, -(-samples // hold)), hold, samples)
+    return amplitude * _hold_bits(
+        _generator(seed).integers(0, 2, -(-samples // hold)), hold, samples
+    )
 
 
 def sign_symmetric(u: Vector) -> Vector:
@@ -423,7 +425,7 @@ def _van_der_corput(count: int) -> Vector:
     return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
 
 
-def _held(bits: Any, hold: int, samples: int) -> Vector:
+def _hold_bits(bits: Any, hold: int, samples: int) -> Vector:
     """Return the samples of held bits, 0 as -1 and 1 as 1."""
     return np.repeat(2.0 * bits - 1.0, hold)[:samples]
 

@@ -146,7 +146,7 @@ class Suspect:
         | `expression` | x itself | |
         | `lag` | x behind a first-order lag | |
         | `backlash` | play `z⁺ = min(max(z, x − width), x + width)` | half of the gap |
-        | `lugre` | bristle `z⁺ = z + d − abs(d) z/width`, d the step of x | deflection when sliding |
+        | `lugre` | bristle `z⁺ = z + d − abs(d) z/width`, d the step of x | largest z |
         | `bouc_wen` | hysteresis `z⁺ = z + d − (abs(d) abs(z) z + d z²)/(2 width²)` | largest z |
 
         Args:
@@ -165,7 +165,7 @@ class Suspect:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
             '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
         """
-        text, label, on = written(
+        text, label, on = suspect_text(
             kind, on, width, lambda text: parse(text, constants), "v[k-1]", time_constant
         )
         memory = memory_of(kind, on, width, time_constant)
@@ -278,17 +278,20 @@ def check_coefficient(suspect: str, coefficient: Any) -> None:
 def memory_of(
     kind: str, on: str | None, width: float | None, time_constant: float | None
 ) -> MemoryTerm | None:
-    """Return the memory of a kind, None of a kind without one; arguments are those of `written`."""
+    """Return the memory of a kind, None of a kind without one.
+
+    Arguments are those of `suspect_text`.
+    """
     if kind not in WITH_MEMORY:
         return None
     from orthaug.analysis.memory import MemoryTerm  # it imports scipy.signal
 
     scale = time_constant if kind == "lag" else width
-    assert on is not None and scale is not None, "`written` has checked them"
+    assert on is not None and scale is not None, "`suspect_text` has checked them"
     return MemoryTerm(kind, on, float(scale))
 
 
-def written(
+def suspect_text(
     kind: str,
     on: str | None,
     width: float | None,

@@ -21,7 +21,7 @@ from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
     Ratio,
-    blocked,
+    held_out_blocks,
     mean_square,
     squared_errors,
 )
@@ -128,7 +128,7 @@ def free_run_error(
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 
 
-def trial_on(
+def score_trial(
     where: str,
     record: Record,
     skip: tuple[int, ...],
@@ -188,7 +188,7 @@ def cross_validate(
     Raises:
         InputError: too few rows for so many blocks.
     """
-    folds = blocked(record, blocks, start)
+    folds = held_out_blocks(record, blocks, start)
     unit = np.std(np.concatenate([e.outputs for e in record.experiments]), axis=0)
 
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
@@ -362,7 +362,8 @@ def verdict(
         >>> import numpy as np
         >>> import orthaug as oa
         >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
-        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + 0.05 * np.random.default_rng(1).normal(size=300))
+        >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
         >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
         >>> train, test = record.split(0.7)
         >>> fit = oa.estimate(train, gain, learner=oa.Terms(("u[k]**3",)))
@@ -383,7 +384,7 @@ def verdict(
         check_type(record, Record, f"tests[{name!r}]", "a Record")
         ordered = fit.model.fitting(record, need_outputs=True)
         skips = (skip,) * len(ordered.experiments)
-        trials.append(trial_on(str(name), ordered, skips, alone.model, fit.model))
+        trials.append(score_trial(str(name), ordered, skips, alone.model, fit.model))
         beyond += extrapolation(str(name), fit.reach(ordered), *trained)
     found = judge(trials, beyond)
     assert found is not None

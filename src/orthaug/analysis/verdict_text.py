@@ -136,7 +136,7 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
         "white": _white,
         "equation_noise": _equation_noise,
         "sensor_noise": _sensor_noise,
-        "unmodelled": _unmodelled,
+        "unmodelled": _unmodelled_text,
     }[verdict](seen)
     if (
         verdict == "unmodelled"
@@ -152,7 +152,9 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
     if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
         warnings = (
-            _coloured("errors of the free run are" if seen.simulated else "one-step residual is"),
+            _colour_warning(
+                "errors of the free run are" if seen.simulated else "one-step residual is"
+            ),
         )
     return text, warnings
 
@@ -183,12 +185,12 @@ def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
             f"The one-step residual is white: {so}, and no criterion is better than this one.",
             (),
         )
-    return _small(seen), ()
+    return _small_residual_text(seen), ()
 
 
 def _equation_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if not seen.complete and not (seen.simulated and seen.white):
-        return _small(seen), ()
+        return _small_residual_text(seen), ()
     asked = ""
     if seen.simulated:
         asked = " The one-step criterion is the more precise one here."
@@ -235,11 +237,11 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
             f". The noise is {100 * seen.noise:.0f} % of the least variance among the lagged "
             "outputs: the sampling is too fast for one-step estimation"
         )
-    steps = f" {_quantised(seen)}" if seen.steps else ""
+    steps = f" {_quantisation_text(seen)}" if seen.steps else ""
     return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
 
 
-def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
+def _unmodelled_text(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     findings = [
         f"its largest autocorrelation is {max((t.largest_acf or 0.0) for t in seen.own):.2f} "
         "in size"
@@ -252,17 +254,23 @@ def _unmodelled(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
     opening = f"The {seen.what}, {_size(seen)}, is not noise alone: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
-    return " ".join(part for part in (opening, _shares(seen), _quantised(seen), advice) if part), ()
+    return " ".join(
+        part for part in (opening, _shares(seen), _quantisation_text(seen), advice) if part
+    ), ()
 
 
-def _quantised(seen: Finding) -> str:
+def _quantisation_text(seen: Finding) -> str:
     """Return sentences on an output's quantisation that colours the one-step residual."""
     if not seen.steps:
         return ""
     units = {c.name: f" {c.unit}".rstrip() for c in seen.fit.problem.record.outputs}
-    each = {test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}{units[test.name]}, "
-        f"and the one-step residual ({test.rms:.2g}{units[test.name]}) is no larger"
-            for test in seen.tests if test.name in seen.steps}  # fmt: skip
+    each = {
+        test.name: f"{test.name} is measured in steps of {seen.steps[test.name]:.3g}"
+        f"{units[test.name]}, and the one-step residual ({test.rms:.2g}{units[test.name]}) is no "
+        "larger"
+        for test in seen.tests
+        if test.name in seen.steps
+    }
     trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
     return (
         f"{'; '.join(each.values())}: such steps colour it as noise on the output does, and "
@@ -276,7 +284,7 @@ def _cause(seen: Finding) -> str:
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"the effect of {_joined(followed[:_LISTED])} has a form that was not tried, or "
+            f"the effect of {_join_names(followed[:_LISTED])} has a form that was not tried, or "
             "dynamics beyond the lags; test a form by your own `[[suspects]]`"
         )
     if seen.drifts:
@@ -290,16 +298,18 @@ def _cause(seen: Finding) -> str:
     )
 
 
-def _joined(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _small(seen: Finding) -> str:
+def _small_residual_text(seen: Finding) -> str:
     """Return sentences on a residual that the tests reject but hardly anything predicts."""
     colour = " Its colour is that of the noise." if seen.simulated and not seen.white else ""
     followed = seen.follows()
     shown = (
-        f"mostly noise, but still follows {_joined(followed)}" if followed else "noise by all tests"
+        f"mostly noise, but still follows {_join_names(followed)}"
+        if followed
+        else "noise by all tests"
     )
     advice = _advice(
         seen, "what it follows is a small effect" if followed else "it is the noise floor"
@@ -355,7 +365,7 @@ def _sentence(change: Change) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _coloured(what: str) -> Warning:
+def _colour_warning(what: str) -> Warning:
     text = (
         f"standard errors of θ assume a white residual, but the {what} coloured: they are "
         "only a rough guide."

@@ -160,7 +160,7 @@ def usable(model: Model | MotionModel, record: Record) -> Record:
     return record
 
 
-def visited_by(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
+def sample_free_run(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
     """Return states of a free run from measured outputs, up to where it diverged."""
     form: Dynamics = model.form
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
@@ -181,7 +181,7 @@ def visited_by(model: Model, record: Record, free_run: Response, most: int) -> R
     return replace(found, diverged=tuple(diverged))
 
 
-def measured_by(model: Model, record: Record, most: int) -> RunSample:
+def sample_measured(model: Model, record: Record, most: int) -> RunSample:
     """Return states as the measured outputs give them."""
     form: Dynamics = model.form
     record = usable(model, record)
@@ -198,7 +198,7 @@ def _visits(
 ) -> RunSample:
     """Return points spread evenly over all experiments, up to the end of each."""
     every = RowIndex.of([end - form.first_row for end in ends], form.first_row)
-    some = every.take(evenly(len(every), most))
+    some = every.take(even_indices(len(every), most))
     pieces = []
     for i, experiment in enumerate(record.experiments):
         rows = some.row[some.experiment == i]
@@ -225,7 +225,7 @@ def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
     return np.where(cost > 0, 1 / positive(cost), positive(points.states.std(axis=0)))
 
 
-def evenly(count: int, most: int) -> Int[np.ndarray, "m"]:
+def even_indices(count: int, most: int) -> Int[np.ndarray, "m"]:
     """Return at most `most` of `count` indices, spread evenly."""
     return (
         np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)

@@ -45,7 +45,7 @@ def cross_correlation(residual: Pieces, inputs: Pieces, lags: int = 25) -> Vecto
     At τ ≥ 0 the residual follows the input. Lags are cut as in `autocorrelation`; None where one
     signal is constant.
     """
-    e, u = standardised(residual), standardised(inputs)
+    e, u = standardise(residual), standardise(inputs)
     if e is None or u is None:
         return None
     reach = min(lags, max(map(len, e)) - 1)
@@ -74,7 +74,7 @@ def pieces_of(signal: Pieces) -> list[Vector]:
     return [np.asarray(one, dtype=float) for one in parts]
 
 
-def standardised(signal: Pieces) -> list[Vector] | None:
+def standardise(signal: Pieces) -> list[Vector] | None:
     """Return the signal less the mean of all samples, with a sum of squares of 1.
 
     None for a signal that is constant or not finite.
@@ -86,10 +86,10 @@ def standardised(signal: Pieces) -> list[Vector] | None:
         return None
     whole = whole / size - np.mean(whole / size)  # so that no square underflows
     norm = np.linalg.norm(whole)
-    return None if norm <= CONSTANT * np.sqrt(len(whole)) else cut(whole / norm, parts)
+    return None if norm <= CONSTANT * np.sqrt(len(whole)) else split_like(whole / norm, parts)
 
 
-def cut(whole: Any, like: Sequence[Vector]) -> list[Any]:
+def split_like(whole: Any, like: Sequence[Vector]) -> list[Any]:
     """Return a signal in experiments as long as those of another."""
     return np.split(whole, np.cumsum([len(one) for one in like])[:-1])
 
@@ -152,7 +152,7 @@ def normality(signal: Pieces) -> Normality | None:
     It assumes independent samples. The distribution is approached slowly: below some 2000 rows the
     p-value is rough.
     """
-    e = standardised(signal)
+    e = standardise(signal)
     if e is None:
         return None
     n, whole = sum(map(len, e)), np.concatenate(e)
@@ -161,12 +161,12 @@ def normality(signal: Pieces) -> Normality | None:
     return Normality(statistic, float(scipy.special.chdtrc(2, statistic)), skewness, kurtosis)
 
 
-def whitening(signal: Pieces, largest: int = 25) -> Vector | None:
+def whitening_filter(signal: Pieces, largest: int = 25) -> Vector | None:
     """Return the coefficients (1, a_1, …, a_p) of the whitening `A(q) e_k = ε_k`, by Burg.
 
     e is the signal less its mean, ε is white.
 
     None for a signal that is constant or not finite.
     """
-    pieces = standardised(signal)
+    pieces = standardise(signal)
     return None if pieces is None else burg(pieces, largest)

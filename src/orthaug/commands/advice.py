@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug._base.lines import counted
+from orthaug._base.lines import plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.suspects import Suspect
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
-from orthaug.fitting.held_out import Pieces, Ratio, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.physics.motion import HOLDS
 from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult, SuspectResult
@@ -71,7 +71,9 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
         and result.residuals.verdict == "white"
         and not result.residuals.changes
     ):
-        return _once(list(_suspected_terms(job, result, fit)) if _biased(result) else [])
+        return _unique_proposals(
+            list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
+        )
     found = [
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
@@ -79,14 +81,16 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
         *_learner_for_equation(job, result, fit),
         *_holds(job, result),
     ]
-    return _once(sorted(found, key=lambda proposal: proposal.learns))  # a learner takes longest
+    return _unique_proposals(
+        sorted(found, key=lambda proposal: proposal.learns)
+    )  # a learner takes longest
 
 
-def _once(found: list[Proposal]) -> list[Proposal]:
+def _unique_proposals(found: list[Proposal]) -> list[Proposal]:
     return list({proposal.words: proposal for proposal in reversed(found)}.values())[::-1]
 
 
-def _biased(result: FitResult) -> bool:
+def _is_biased(result: FitResult) -> bool:
     return any(
         row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ()))
     )
@@ -109,6 +113,8 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
     left = _residual_columns(fit) if plain else None
     found = []
     for entry in result.bias or ():
+        if entry.memory is not None:  # no expression of one row is that term
+            continue
         share, size = entry.explained, entry.coefficient_found
         if entry.residual is not None:
             share, size = entry.residual.share, entry.residual.coefficient
@@ -132,20 +138,20 @@ def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
     Both are scaled by the deviations of the outputs; the residual is the one-step one.
     """
     problem = fit.problem
-    x, unit = problem.rows.x[:: _every(fit)], problem.deviation
+    x, unit = problem.rows.x[:: _stride(fit)], problem.deviation
     phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
     basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
     runs = fit.model.predict(problem.record).trajectories
     error = (
         np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[
-            :: _every(fit)
+            :: _stride(fit)
         ]
         / unit
     )
     return basis, error.ravel() - basis @ (basis.T @ error.ravel())
 
 
-def _every(fit: Any) -> int:
+def _stride(fit: Any) -> int:
     """Return the stride of the rows that are looked at."""
     return 1 + len(fit.problem.rows.x) // _ROWS
 
@@ -161,7 +167,7 @@ def _residual_share(
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
     column = (
-        suspect.values(problem.rows.x[:: _every(fit)], problem.layout, problem.outputs)
+        suspect.values(problem.rows.x[:: _stride(fit)], problem.layout, problem.outputs)
         / problem.deviation
     )
     rest = column.ravel() - basis @ (basis.T @ column.ravel())
@@ -193,7 +199,7 @@ def _term(
         places = declared["motion"]["states"]
         key = "next" if spec.motion.integrator == "discrete" else "derivative"
         own = str(places[equation][key])
-        if f"*{_squeezed(expression)}" in _squeezed(own):
+        if f"*{_squeeze(expression)}" in _squeeze(own):
             return
         change: dict[str, Any] = {
             f"motion.states.{equation}.{key}": f"{own} + {name}*({expression})",
@@ -204,7 +210,7 @@ def _term(
         terms = declared["baseline"]["terms"]
         several = len(spec.data.outputs) > 1
         if any(
-            _same(str(term["regressor"]), expression, term.get("output"), equation)
+            _is_same(str(term["regressor"]), expression, term.get("output"), equation)
             for term in terms
         ):
             return
@@ -250,12 +256,12 @@ def _new_name(job: Job) -> str:
     return name
 
 
-def _squeezed(text: str) -> str:
+def _squeeze(text: str) -> str:
     return "".join(text.split())
 
 
-def _same(one: str, other: str, output: str | None, equation: str | None) -> bool:
-    return _squeezed(one) == _squeezed(other) and (
+def _is_same(one: str, other: str, output: str | None, equation: str | None) -> bool:
+    return _squeeze(one) == _squeeze(other) and (
         output is None or equation is None or output == equation
     )
 
@@ -288,7 +294,7 @@ def _lag_words(change: ChangeResult) -> str:
 
 def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     """Yield a learner where none was tried, one that sees more, one of more neurons."""
-    from orthaug.physics.shared import seen
+    from orthaug.physics.shared import seen_columns
 
     spec, problem, bound = job.spec, job.problem, fit.model.form.bound
     if spec.motion is not None:
@@ -298,7 +304,7 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
         return
     if bound is None:  # it was tried, and physics alone was better
         return
-    visible = seen(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
+    visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
     now = spec.learner_inputs()
     if hidden and now is not None:
@@ -351,7 +357,7 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
 
 
 def _reads(inputs: tuple[str, ...], variable: str) -> bool:
-    return any(_squeezed(text) == variable for text in inputs)
+    return any(_squeeze(text) == variable for text in inputs)
 
 
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
@@ -400,7 +406,7 @@ class ValidationRows:
                 "the validation part",
                 "",
             )
-        training, held = blocked(job.train.record, _PIECES, job.first_row)[-1]
+        training, held = held_out_blocks(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
 
 
@@ -429,15 +435,15 @@ class Trials:
     substeps: int | None = None
     """Substeps of a motion that is integrated."""
 
-    def changed(self, change: dict[str, Any]) -> Job:
+    def changed_job(self, change: dict[str, Any]) -> Job:
         """Return the job of a changed spec, with the substeps of the fit: a search would cost most.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
         fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
-        return self.job.changed(
-            spec_model().model_validate(changed(self.job.declaration, change | fixed))
+        return self.job.with_spec(
+            spec_model().model_validate(apply_change(self.job.declaration, change | fixed))
         )
 
     def run(
@@ -459,7 +465,7 @@ class Trials:
     def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
         """Return the trial of a proposal."""
         try:
-            job = self.changed(proposal.change)
+            job = self.changed_job(proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return ProposalErrors(proposal, None)
@@ -469,7 +475,7 @@ class Trials:
         return ProposalErrors(proposal, pieces, physics_only)
 
 
-def changed(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+def apply_change(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     """Return a declaration with the values of a change; dots in a key separate its levels."""
     found = deepcopy(declaration)
     for key, value in change.items():
@@ -502,15 +508,15 @@ def advise(
     motion = result.motion
     substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
-    base = trials.run(trials.changed({}), variant)
+    base = trials.run(trials.changed_job({}), variant)
     if base is None:
         return None
     chosen = found[: _MOST if motion is None else _MOST_OF_A_MOTION]
     tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
-    return _concluded(base, tried, rows, len(found) - len(tried), learns)
+    return _conclude_trials(base, tried, rows, len(found) - len(tried), learns)
 
 
-def _concluded(
+def _conclude_trials(
     base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
@@ -536,21 +542,21 @@ def _concluded(
         f"run over {rows.where}"
     )
     text += (
-        f"{rows.which}: {counted(len(tried), 'change')} of the spec, "
-        f"{_which(len(helps), len(tried))}."
+        f"{rows.which}: {plural(len(tried), 'change')} of the spec, "
+        f"{_relative_clause(len(helps), len(tried))}."
     )
     if worse:
-        named = "; ".join(f"{one.proposal.words} ({_after(one)})" for one in worse[:_LISTED])
+        named = "; ".join(f"{one.proposal.words} ({_error_text(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No gain from {_error(before)}: {named}{more}."
     if left:
         text += (
-            f" {counted(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
+            f" {plural(left, 'change')} {'was' if left == 1 else 'were'} not tried, to spare time."
         )
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 
-def _which(better: int, tried: int) -> str:
+def _relative_clause(better: int, tried: int) -> str:
     if tried == 1:
         return "which betters it" if better else "which does not improve it"
     return (
@@ -585,7 +591,7 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
     )
 
 
-def _after(one: ProposalErrors) -> str:
+def _error_text(one: ProposalErrors) -> str:
     return (
         "no fit"
         if one.pieces is None

@@ -56,7 +56,7 @@ def attempt_warned(
     None where it fails.
     """
 
-    def found() -> T | None:
+    def warn_and_run() -> T | None:
         finding: Any = analysis()
         if finding is not None:
             warnings.extend(finding.warnings)
@@ -64,4 +64,4 @@ def attempt_warned(
             warnings.append(without)
         return finding
 
-    return attempt(what, found, warnings, None)
+    return attempt(what, warn_and_run, warnings, None)

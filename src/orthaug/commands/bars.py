@@ -79,7 +79,7 @@ def training_bar(
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.reporting(lambda: reached, bar.stop),
+        WATCH.report_stop(lambda: reached, bar.stop),
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
@@ -156,7 +156,7 @@ def study_bars() -> Iterator[Callable[[str, int, int], None]]:
     with (
         _deferred_interrupt() as interrupted,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), transient=False) as bar,
-        WATCH.reporting(lambda: reached, bar.stop, GO_ON),
+        WATCH.report_stop(lambda: reached, bar.stop, GO_ON),
     ):
         tasks: dict[str, Any] = {}
 
@@ -185,7 +185,7 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
     with (
         _asked_to_stop() as asked,
         drawn_bar(MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()) as bar,
-        WATCH.reporting(lambda: "the selection of a structure", bar.stop),
+        WATCH.report_stop(lambda: "the selection of a structure", bar.stop),
     ):
         tasks: dict[str, Any] = {}
         judged: dict[str, list[float]] = {}
@@ -212,7 +212,7 @@ def selection_bar(most: int) -> Iterator[Callable[[str, Any], None]]:
 def _asked_to_stop() -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C sets."""
     if WATCH.active:
-        with WATCH.asking() as event:
+        with WATCH.ask_to_stop() as event:
             yield event
     else:
         with _deferred_interrupt() as event:

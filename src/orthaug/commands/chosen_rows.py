@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
-from orthaug.commands.parts import expanded
+from orthaug.commands.parts import expand_files
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
-from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, parted
+from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, split_record
 
 if TYPE_CHECKING:
-    from orthaug.commands.data_sections import PartSection
     from orthaug.commands.lagged_job import LaggedJob
     from orthaug.commands.spec import Spec
-    from orthaug.data.record import Record
 
 _CONDITIONAL = (
     "no standard errors and no intervals: [selection.chosen_on] says that the terms were "
@@ -69,8 +67,8 @@ def parts_of(
     if network and not halves:
         return Parts(record, record, CONDITIONAL)
     if halves is False:
-        return Parts(record, record, Intervals.none("`selection.halves` is false"))
-    files, ranges = expanded(path, section.files, "train"), Rows.of((), section.rows).ranges
+        return Parts(record, record, Intervals.empty("`selection.halves` is false"))
+    files, ranges = expand_files(path, section.files, "train"), Rows.of((), section.rows).ranges
     fault = _not_cut(job, len(files) * max(len(ranges), 1))
     by = None
     if len(files) > 1:
@@ -78,11 +76,11 @@ def parts_of(
     try:
         if fault:
             raise InputError(fault)
-        return parted(record, baseline, lags, by=by, **({"least": 1} if halves else {}))
+        return split_record(record, baseline, lags, by=by, **({"least": 1} if halves else {}))
     except InputError as error:
         if halves:
             raise InputError(f"{path}: 'selection.halves': {error}.") from None
-        return Parts(record, record, Intervals.none(str(error)))
+        return Parts(record, record, Intervals.empty(str(error)))
 
 
 def _not_cut(job: LaggedJob, expected: int) -> str:
@@ -100,10 +98,10 @@ def _not_cut(job: LaggedJob, expected: int) -> str:
     return ""
 
 
-def cut(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
+def split_rows(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
     """Return the rows that chose and those that are fitted, as a spec says them."""
     section, record = job.spec.data.train, job.train.record
-    files = expanded(job.path, section.files, "train")
+    files = expand_files(job.path, section.files, "train")
     whole = Rows.of(files, section.rows)
     if parts.fitted is record:
         return whole, whole
@@ -112,16 +110,12 @@ def cut(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
         if len(files) > 1:
             return Rows(whole.files[:count], whole.ranges), Rows(whole.files[count:], whole.ranges)
         return Rows(whole.files, whole.ranges[:count]), Rows(whole.files, whole.ranges[count:])
-    ranges = whole.ranges or ((0, _rows_of(section, record)),)
+    ranges = whole.ranges or ((0, section.every * len(record)),)
     lengths = [len(one) for one in parts.chooses.experiments]
     places = [first + section.every * lengths[i] for i, (first, _) in enumerate(ranges)]
     first = tuple((a, place) for (a, _), place in zip(ranges, places, strict=True))
     second = tuple((place, b) for (_, b), place in zip(ranges, places, strict=True))
     return Rows(whole.files, first), Rows(whole.files, second)
-
-
-def _rows_of(section: PartSection, record: Record) -> int:
-    return section.every * len(record)
 
 
 def intervals_of(job: Any, fit: Any) -> Intervals | None:
@@ -138,14 +132,14 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
         or not isinstance(bound.learner, Terms)
     ):
         return None
-    train = Rows.of(expanded(job.path, spec.data.train.files, "train"), spec.data.train.rows)
+    train = Rows.of(expand_files(job.path, spec.data.train.files, "train"), spec.data.train.rows)
     if Rows.of(chosen.files, chosen.rows).meets(train, job.path.parent):
         return Intervals("none", _CONDITIONAL)
     return of_parts(job.problem.count)
 
 
 def after_choice(job: Any, fit: Any) -> tuple[Any, Intervals | None]:
-    """Return a fit and the source of its intervals; without these where its rows chose its terms."""
+    """Return a fit and the source of its intervals; without them if its rows chose its terms."""
     found = intervals_of(job, fit) if fit.status.ok else None
     if found is None or found.source != "none":
         return fit, found

@@ -72,13 +72,13 @@ def check(
     check_figure(figure, *job.files, force=force)
     if job.spec.motion is not None:  # its runs are computed
         prepare_jax()
-    result = kind_of(job).checked(job)
+    result = kind_of(job).check(job)
     print_result(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
-    refused = kind_of(job).refused(job, result)
+    refused = kind_of(job).refusal(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 
@@ -365,19 +365,19 @@ def reproduce(
 
     folder = out or Path("orthaug-out/reproduction")
     reproduction.check_output(folder, force=force)
-    entries = reproduction.chosen(name)
+    entries = reproduction.choose_studies(name)
     check_choice(pipeline, reproduction.PIPELINES, "--pipeline")
     prepare_jax()
     client = None
     if scheduler is not None:
-        from orthaug.models.cluster import connected
+        from orthaug.models.cluster import connect
 
-        client = connected(scheduler, None)
+        client = connect(scheduler, None)
     with study_bars() as progress:
         reproduced = reproduction.reproduce(
             entries, pipeline=pipeline, small=small, progress=progress, client=client
         )
-    with WATCH.reporting(lambda: "the writing of the page", then=GO_ON):
+    with WATCH.report_stop(lambda: "the writing of the page", then=GO_ON):
         reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
 

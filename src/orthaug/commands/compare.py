@@ -61,7 +61,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
     out with the reason. With a validation part the row of the lowest error there is marked as
     chosen.
     """
-    models = {str(path): _matching(path, job) for path in saved}
+    models = {str(path): _load_matching(path, job) for path in saved}
     fitted, left_out = {}, {}
     criterion, decided = _criterion(job, progress)
     for number, kind in enumerate(job.compared):
@@ -87,7 +87,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         "spec": job.declaration,
         "data": job.data,
         "comparison": rows,
-        "chosen": _chosen(rows, criterion.simulates) if job.validation else None,
+        "chosen": _choose_row(rows, criterion.simulates) if job.validation else None,
         "left_out": left_out,
         "warnings": job.warnings,
     }
@@ -156,7 +156,7 @@ def compare_report(comparison: Comparison) -> str:
     )
 
 
-def _matching(path: Path, job: Job) -> Model | MotionModel:
+def _load_matching(path: Path, job: Job) -> Model | MotionModel:
     """Return a saved model that fits the job's data."""
     model = storage.load(path)
     record = job.problem.record
@@ -207,7 +207,7 @@ def _row_of(
     )
 
 
-def _chosen(rows: Sequence[RowResult], simulates: bool) -> str | None:
+def _choose_row(rows: Sequence[RowResult], simulates: bool) -> str | None:
     """Return the row with the lowest error on the validation part, by the criterion of training.
 
     Physics alone wins where the verdict is that the learner of that row does not help.

@@ -151,9 +151,9 @@ def engine_of(section: EngineSection, kind: str) -> Engine:
         InputError: one that is not installed, or cannot be reached.
     """
     if kind == "dask":
-        from orthaug.models.cluster import Dask, connected
+        from orthaug.models.cluster import Dask, connect
 
-        return Dask(connected(section.scheduler, section.workers))
+        return Dask(connect(section.scheduler, section.workers))
     if kind == "devices":
         from orthaug.models import hosts
         from orthaug.models.devices import Devices
@@ -215,7 +215,7 @@ class MotionSection(Section):
 
     @property
     def learns(self) -> bool:
-        """Whether a learner is added to any equation or output."""
+        """True if a learner is added to any equation or output."""
         outputs = (
             output.learned for output in self.outputs.values() if not isinstance(output, str)
         )

@@ -23,7 +23,8 @@ from orthaug.studies.synthetic import Example, mass_spring_damper
 RESTARTS = 3
 ITERATIONS = LevenbergMarquardt().iterations  # those on which a progress bar counts
 
-SPEC = f"""# The paper's mass-spring-damper (Sect. 5.2): linear physics, unmodelled Stribeck friction.
+SPEC = f"""\
+# The paper's mass-spring-damper (Sect. 5.2): linear physics, unmodelled Stribeck friction.
 [data]
 sampling_time = 0.01
 inputs  = ["force"]

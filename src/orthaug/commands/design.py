@@ -13,7 +13,7 @@ from orthaug._base.folders import whole_file
 from orthaug.analysis.design import MOST_SAMPLES, Design, design_input
 from orthaug.commands.job import Job
 from orthaug.commands.motion_job import MotionJob
-from orthaug.commands.suspects import declared
+from orthaug.commands.suspects import declare_suspects
 
 
 def design_for(job: Job) -> Design:
@@ -40,7 +40,7 @@ def design_for(job: Job) -> Design:
         asked["channel"] = _input(
             section.input, [channel.name for channel in job.problem.record.inputs]
         )
-        asked["known_inputs"] = _others(job, asked["channel"], section.samples)
+        asked["known_inputs"] = _other_inputs(job, asked["channel"], section.samples)
         asked["sampling_time"] = job.problem.record.sampling_time
         if isinstance(job, MotionJob):
             return _of_motion(job, asked, section.noise)
@@ -58,7 +58,7 @@ def _of_lags(job: Job, asked: dict[str, Any], noise: float | None) -> Design:
         problem.baseline,
         outputs=problem.outputs,
         inputs=[channel.name for channel in problem.record.inputs],
-        suspects=declared(job.spec.suspects, problem),
+        suspects=declare_suspects(job.spec.suspects, problem),
         noise=tuple(residual.std(axis=0)) if noise is None else noise,
         theta=given if np.all(given) else theta,
         **asked,
@@ -73,7 +73,7 @@ def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> De
     spec, motion = job.spec, job.problem.motion
     task = MotionTask.of(without_learner(job.problem), None, spec.declared_criterion())
     solver: Any = spec.declared_solver()
-    task = task.prepared(solver, job.structure)
+    task = task.prepare(solver, job.structure)
     if task.physics is None:
         raise InputError(
             "physics alone has no finite free run from its initial values; give others."
@@ -96,7 +96,7 @@ def _input(name: str | None, known: list[str]) -> str:
     return known[0] if name is None else check_choice(name, known, "`input`")
 
 
-def _others(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
+def _other_inputs(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
     """Return the other inputs, as in the longest experiment of the training data.
 
     They are repeated where that ends.
@@ -127,7 +127,7 @@ def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
     assert job.spec.design is not None
     names = [channel.name for channel in job.problem.record.inputs]
     chosen, count = job.spec.design.input or names[0], len(design.signal)
-    others = _others(job, chosen, count) | {chosen: design.signal}
+    others = _other_inputs(job, chosen, count) | {chosen: design.signal}
     columns = {"time": np.arange(count) * job.problem.record.sampling_time} | {
         name: others[name] for name in names
     }

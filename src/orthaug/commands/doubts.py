@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 _LISTED = 3  # parameters, and terms with memory
 _DETERMINED = re.compile(
-    r"( The fit determines | Of the physical parameters it determines )[^.]*\.|: the fit determines [^.]*"
+    r"( The fit determines | Of the physical parameters it determines )[^.]*\."
+    r"|: the fit determines [^.]*"
 )
 
 
@@ -49,7 +50,7 @@ def with_doubts(fitted: Any) -> Any:
     warnings = [WarningResult.model_validate(warning) for warning in failed]
     if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
         warnings.append(
-            WarningResult(code="unexplained", text=_unexplained(test, bool(result.residuals)))
+            WarningResult(code="unexplained", text=_unexplained_text(test, bool(result.residuals)))
         )
     if test is not None and test.has_memory:
         warnings.append(WarningResult(code="hidden_state", text=_hidden_state(fit, test)))
@@ -77,7 +78,7 @@ def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | N
     ]
 
 
-def _unexplained(test: StructureTest | None, judged: bool) -> str:
+def _unexplained_text(test: StructureTest | None, judged: bool) -> str:
     if test is None or not test.found:
         what = "the residual holds more than noise"
         what += " (its verdict is `unmodelled`)" if judged else ""
@@ -127,7 +128,7 @@ def _movement_text(fit: Any, best: FamilyTest) -> str:
     values = _values_with(fit, best)
     if not values:
         return ""
-    now = _now(fit)
+    now = _current_values(fit)
     moves = sorted(
         values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300)
     )
@@ -137,14 +138,14 @@ def _movement_text(fit: Any, best: FamilyTest) -> str:
     return f" With it the fit gives {listed}."
 
 
-def _now(fit: Any) -> dict[str, float]:
+def _current_values(fit: Any) -> dict[str, float]:
     names = fit.problem.baseline.names if fit.lagged else fit.problem.motion.names
     return dict(zip(names, map(float, fit.theta if fit.lagged else fit.values), strict=True))
 
 
 def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
     """Return the parameters of a fit with an additional term."""
-    names = list(_now(fit))
+    names = list(_current_values(fit))
     moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
     if len(best.moves) != len(names):
         return {}

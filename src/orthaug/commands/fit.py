@@ -120,7 +120,7 @@ def with_verdict(fitted: FitReport) -> FitReport:
     if verdict is not None and fit.model.form.bound is not None:
         text = (
             *verdict.warnings,
-            *_unexplained(fitted, None if verdict.code == "helps" else physics),
+            *_unexplained_warnings(fitted, None if verdict.code == "helps" else physics),
         )
         warnings += [WarningResult.model_validate(warning) for warning in text]
     result = FitResult.model_validate(
@@ -142,7 +142,7 @@ def _physics_alone(fitted: FitReport) -> Any:
     )
 
 
-def _unexplained(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
+def _unexplained_warnings(fitted: FitReport, physics: Callable[[], Any] | None) -> list[Warning]:
     """Return a warning where the learner may have taken an unknown share of a parameter.
 
     It could imitate these parameters, and no suspect explains what it found.
@@ -205,7 +205,7 @@ def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
 
 def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitReport:
     """Train a variant of a job and score every part; `judge_fit` judges the learner."""
-    progress.planned(job.planned(variant))
+    progress.planned(job.plan_of(variant))
     return report_of(job, job.run(variant, progress))
 
 
@@ -354,7 +354,7 @@ def judge_fit(
             to make them, where there is no validation or test part or where the spec asks for them.
         alone: the responses of physics alone by part, where they are there already.
     """
-    from orthaug.analysis.validation import extrapolation, judge, trial_on, trials_of
+    from orthaug.analysis.validation import extrapolation, judge, score_trial, trials_of
 
     job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
     held_out = job.parts[1:]
@@ -376,7 +376,7 @@ def judge_fit(
         ran = None if alone is None else alone[part.name][1]
         response = fitted.responses[part.name][1]
         trials.append(
-            trial_on(
+            score_trial(
                 part.name,
                 part.record,
                 part.skips,

@@ -12,7 +12,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
-from orthaug._base.lines import counted, percent
+from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import relative
 from orthaug.data.columns import Column
 from orthaug.data.headers import is_time
@@ -76,9 +76,9 @@ def step_of(found: Survey, roles: Roles) -> float:
     return roles.sampling_time or found.clock.step or 1.0
 
 
-def lacking(rows: int) -> str:
+def gap_text(rows: int) -> str:
     """Return the number of rows that lack a value, in words."""
-    return f"{counted(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
+    return f"{plural(rows, 'row')} lack{'s' if rows == 1 else ''} a value"
 
 
 def spec_text(
@@ -341,7 +341,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
         raise InputError(f"{found.path}: {_no_output_reason(found, _join(inputs))}")
-    some = _listed([c.header for c in found.signals])
+    some = _list_columns([c.header for c in found.signals])
     output = free.pop() if outputs is None else None
     rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
@@ -354,7 +354,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
-    others = left_out(found, [*found.signals])
+    others = list_unused(found, [*found.signals])
     return (
         f"{found.path}: {said}: {some}. Say both, separated by commas, such as "
         f"{proposed}{none}; columns that are not named are left out."
@@ -369,8 +369,8 @@ def _join(names: Names | None) -> str | None:
 
 def _no_output_reason(found: Survey, inputs: str | None) -> str:
     """Return the reason why no column is left for an output."""
-    rows = counted(max(column.filled for column in found.columns), "row")
-    others = left_out(found, [*found.signals])
+    rows = plural(max(column.filled for column in found.columns), "row")
+    others = list_unused(found, [*found.signals])
     if not found.signals:
         return (
             f"no column can be a channel, {rows}: {others}. A first model needs an output that "
@@ -382,15 +382,15 @@ def _no_output_reason(found: Survey, inputs: str | None) -> str:
     return f"{text}; left out: {others}." if others else f"{text}."
 
 
-def left_out(found: Survey, used: Sequence[Column]) -> str:
+def list_unused(found: Survey, used: Sequence[Column]) -> str:
     """Return a list of the unused columns, except the time, with the reasons."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    return _listed(
+    return _list_columns(
         [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
     )
 
 
-def _listed(columns: Sequence[str]) -> str:
+def _list_columns(columns: Sequence[str]) -> str:
     more = f" and {len(columns) - _LISTED} more" if len(columns) > _LISTED else ""
     return ", ".join(columns[:_LISTED]) + more
 
@@ -415,10 +415,10 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
         )
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
-        f"{counted(lost, 'training row')} in longer runs of wild samples "
+        f"{plural(lost, 'training row')} in longer runs of wild samples "
         f"{'is' if lost == 1 else 'are'} left out"
     )
-    gaps = lacking(missing) if missing else wild if lost else ""
+    gaps = gap_text(missing) if missing else wild if lost else ""
     text = spec_text(found, roles, out, rows, cut, gaps, named, model)
     return Draft(
         text,
@@ -515,10 +515,10 @@ def _account(
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
     if missing:
         filled = any(kind == "fill" for kind, _ in steps_of(found, roles))
-        lines.append(f"{lacking(missing)} and will be left out, with all windows that touch them")
+        lines.append(f"{gap_text(missing)} and will be left out, with all windows that touch them")
         if filled:
             lines[-1] = (
-                f"{lacking(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
+                f"{gap_text(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
             )
     lines += [wild] if wild else []
     lines += notes
@@ -570,13 +570,13 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     )
     text += f": {low:.4g} to {high:.4g} {column.unit}".rstrip()
     if column.missing:
-        text += f"; {counted(column.missing, 'cell')} missing"
+        text += f"; {plural(column.missing, 'cell')} missing"
     if spikes and column.spikes:
         text += (
-            f"; {counted(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
+            f"; {plural(column.spikes, 'sample')} far from all neighbours, which the spec replaces"
         )
     for value, count in column.limits:
-        text += f"; {counted(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
+        text += f"; {plural(count, 'row')} at {value:.4g}, perhaps a limit of sensor or actuator"
     if column.quantum is not None:
         moves = (
             f", while it moves by {column.movement:.2g} from row to row"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.commands.parts import Part
@@ -49,14 +49,14 @@ class Variant:
     """None for the criterion that the spec declares."""
 
     @property
-    def alone(self) -> bool:
-        """Whether the variant has no learner."""
+    def physics_only(self) -> bool:
+        """True if the variant has no learner."""
         return self.kind == PHYSICS_ONLY
 
     @property
     def structure_kind(self) -> str | None:
         """Kind of the structure; "orthogonal" for physics alone."""
-        return "orthogonal" if self.alone else self.kind
+        return "orthogonal" if self.physics_only else self.kind
 
     def on(self, fold: Record) -> Variant:
         """Return the variant on a fold."""
@@ -113,7 +113,7 @@ class Job(ABC):
         return lambda fold: self.run(variant.on(fold))
 
     @abstractmethod
-    def changed(self, spec: Spec) -> Job:
+    def with_spec(self, spec: Spec) -> Job:
         """Return the job of another spec on the same data, to be fitted to folds of them.
 
         Raises:
@@ -154,10 +154,10 @@ class Job(ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the physics is linear in θ."""
+        """True if the physics is linear in θ."""
         return False
 
-    def planned(self, variant: Variant) -> Plan:
+    def plan_of(self, variant: Variant) -> Plan:
         """Return the known settings of each run of a variant.
 
         Empty where fits to new weights of the outputs follow.
@@ -165,7 +165,7 @@ class Job(ABC):
         spec = self.spec
         if spec.training.output_weights == "covariance":
             return ()
-        if variant.alone or spec.declared_learner() is None:
+        if variant.physics_only or spec.declared_learner() is None:
             return ({"structure": PHYSICS_ONLY},)
         kind, validated = variant.kind or spec.structure.kind, spec.data.validation is not None
         choices = spec.regularizations(linear=self.linear, validated=validated, kind=kind)
@@ -232,7 +232,7 @@ class Job(ABC):
         )
         validated = self.validation is not None and fold is None
         return {
-            "learner": None if variant.alone else spec.declared_learner(),
+            "learner": None if variant.physics_only else spec.declared_learner(),
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
             "regularization": choices[0]
@@ -264,7 +264,7 @@ def date_of_results() -> datetime:
         epoch.isascii() and epoch.isdecimal() and len(epoch) <= 12 and int(epoch) < _YEAR_10000
     ):
         raise InputError(
-            f"SOURCE_DATE_EPOCH: found {shown(epoch)}; expected whole seconds since 1970 up to "
+            f"SOURCE_DATE_EPOCH: found {show(epoch)}; expected whole seconds since 1970 up to "
             "the year 9999. Unset it for the date of today."
         )
     return datetime.fromtimestamp(int(epoch), UTC)

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 class Kind(Protocol):
     """Interface of the module of a kind of job."""
 
-    def checked(self, job: Any) -> CheckResult:
+    def check(self, job: Any) -> CheckResult:
         """Return the findings before training: excitation, identifiability, possible biases.
 
         Nothing is stored.
         """
         ...
 
-    def refused(self, job: Any, result: CheckResult) -> InputError | None:
+    def refusal(self, job: Any, result: CheckResult) -> InputError | None:
         """Return the reason why the job cannot be fitted, after the report; None where it can."""
         ...
 

@@ -117,12 +117,12 @@ class LaggedJob(Job):
             variant.structure_kind
         )  # scored by predictions, on which the measure has no effect
         weights, lags, learner_inputs = spec.training.output_weights, None, None
-        if not variant.alone and spec.declared_learner() is not None:
+        if not variant.physics_only and spec.declared_learner() is not None:
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
         posed = (self.problem.baseline, lags, learner_inputs)
         return partial(_fitted_to, posed=posed, weights=weights, options=options)
 
-    def changed(self, spec: Spec) -> LaggedJob:
+    def with_spec(self, spec: Spec) -> LaggedJob:
         physics, baseline = (
             spec.physics_map(self.train.record.sampling_time),
             spec.declared_baseline(),
@@ -141,14 +141,14 @@ class LaggedJob(Job):
         if variant.fold is not None:
             return self.fold_fit(variant)(variant.fold)
         structure = self.spec.declared_structure(
-            variant.structure_kind, None if variant.alone else self.measure
+            variant.structure_kind, None if variant.physics_only else self.measure
         )
         options = self.training_options(variant) | {
             "engine": self.engine,
             "checkpoints": self.checkpoints,
         }
         options["ensemble"] = self.spec.training.ensemble and options["learner"] is not None
-        problem = self.problem.physics_alone() if variant.alone else self.problem
+        problem = self.problem.physics_alone() if variant.physics_only else self.problem
         return fit(problem, structure=structure, progress=progress, **options)
 
 
@@ -224,7 +224,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         }
         named |= {"problem": problem, "weighed": weighed, "engine": engine}
         job = LaggedJob(**named, physics=physics, left_out=left_out)
-        check_suspects(spec.suspects, problem)
+        check_suspects(spec.suspects, problem, weighed)
         for part in job.parts:
             part.check_scorable(problem.rows.start, train.record.sampling_time)
             if part is not train:  # `pose` has looked at that

@@ -14,7 +14,7 @@ from orthaug.analysis.imitation import Imitation, imitation
 from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
-from orthaug.commands.suspects import declared
+from orthaug.commands.suspects import declare_suspects
 from orthaug.fitting.elimination import directions
 from orthaug.inference.measures import weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
@@ -42,7 +42,7 @@ _NOT_ANALYSED = Warning(
 _UNKNOWN = ("physical_parameters", "physical_consistency", "sensitivities", "bias")
 
 
-def checked(job: LaggedJob) -> CheckResult:
+def check(job: LaggedJob) -> CheckResult:
     """Return excitation of the data, identifiability of the physics, and bias by suspects."""
     problem = job.problem
     return CheckResult.model_validate(
@@ -67,7 +67,7 @@ def checked(job: LaggedJob) -> CheckResult:
     )
 
 
-def refused(job: LaggedJob, result: CheckResult) -> InputError | None:
+def refusal(job: LaggedJob, result: CheckResult) -> InputError | None:
     """Return the reason why the job cannot be fitted, after the report; None where it can."""
     try:
         require_rank(job.problem.excitation, job.problem.samples)
@@ -99,7 +99,7 @@ def content(
         fields["bias"] = attempt(
             "the bias by suspects", partial(_bias_of, job, fit), warnings, None
         )
-        fields |= _analysed(fit, one_step, free_run, warnings)
+        fields |= _analyse(fit, one_step, free_run, warnings)
     shared = _shared_of(job, fit, others=False)
     rows = parameter_rows(
         fit.problem.baseline.parameters,
@@ -189,7 +189,7 @@ def physics_alone(
     job: LaggedJob, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
     """Return the free run of every part by the model's physics without its learner."""
-    alone = fit.model.alone
+    alone = fit.model.physics_only
     return {part.name: alone.simulate(part.record) for part in job.parts}
 
 
@@ -220,7 +220,7 @@ def _physical_content(job: LaggedJob, fit: Estimate, warnings: list[Any]) -> dic
     }
 
 
-def _analysed(
+def _analyse(
     fit: Estimate, one_step: Response, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
     """Return the findings on the residuals and the free run's sensitivity; warnings are added."""
@@ -259,7 +259,9 @@ def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]
         return []
     linearization = _linearization(job, fit)
     return bias_under(
-        linearization, declared(job.spec.suspects, linearization.problem), certify_usual=fit is None
+        linearization,
+        declare_suspects(job.spec.suspects, linearization.problem),
+        certify_usual=fit is None,
     )
 
 
@@ -270,7 +272,7 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
     linearization = _linearization(job, fit)
-    return budget_on(linearization, fit, declared(job.spec.suspects, linearization.problem))
+    return budget_on(linearization, fit, declare_suspects(job.spec.suspects, linearization.problem))
 
 
 def _with_biases(

@@ -140,7 +140,10 @@ class Page:
     def _repr_html_(self) -> str:
         style = f"width:100%;height:{_HEIGHT}px;border:1px solid rgba(128,128,128,.35)"
         inside = escape(self.html, quote=True)
-        return f'<iframe title="report of the fit" sandbox="allow-scripts" style="{style}" srcdoc="{inside}"></iframe>'
+        return (
+            f'<iframe title="report of the fit" sandbox="allow-scripts" style="{style}" '
+            f'srcdoc="{inside}"></iframe>'
+        )
 
 
 @dataclass(frozen=True)
@@ -196,12 +199,12 @@ def page_of(
         TrainingError: a fit without a usable model.
         InputError: a path that cannot be written, records that do not fit.
     """
-    place = _checked(fit, path)
+    place = _check_path(fit, path)
     job = job_of(fit, {} if tests is None else tests)
     made = replace(
         origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
     )
-    return _written(fit_report(with_doubts(with_verdict(report_of(job, fit))), made), place)
+    return _write_page(fit_report(with_doubts(with_verdict(report_of(job, fit))), made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
@@ -209,11 +212,11 @@ def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None 
 
     Errors as `page_of`.
     """
-    place = _checked(fitted.fit, path)
-    return _written(fit_report(fitted), place)
+    place = _check_path(fitted.fit, path)
+    return _write_page(fit_report(fitted), place)
 
 
-def _checked(fit: Estimate | MotionEstimate, path: str | os.PathLike | None) -> Path | None:
+def _check_path(fit: Estimate | MotionEstimate, path: str | os.PathLike | None) -> Path | None:
     check_type(path, str | os.PathLike | None, "path", "a file's name, or None")
     if path is not None and Path(path).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: a page is HTML; give a name that ends in .html.")
@@ -224,7 +227,7 @@ def _checked(fit: Estimate | MotionEstimate, path: str | os.PathLike | None) -> 
     return None if path is None else Path(path)
 
 
-def _written(text: str, path: Path | None) -> Page:
+def _write_page(text: str, path: Path | None) -> Page:
     if path is not None:
         with whole_file(path, force=True) as partial:
             partial.write_text(text, encoding="utf-8")

@@ -98,7 +98,7 @@ def predict(
     check_file(out, model, data, Path(initial or data), force=force)
     prepare_jax()
     if observer:
-        response, notes = run.observed(opened, horizon)
+        response, notes = run.observe_outputs(opened, horizon)
     else:
         response, notes = opened.model.predict(opened.record, horizon=horizon), []
     _write_response(response, opened, out, force, [*opened.notes, *notes])

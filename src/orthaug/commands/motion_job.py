@@ -23,7 +23,7 @@ from orthaug.fitting.rules import (
     check_motion_choices,
     check_scored,
     check_solver,
-    tried,
+    choose_regularizations,
 )
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MeasurePlace
@@ -77,7 +77,7 @@ class MotionJob(Job):
         """The structure that the spec declares, under its measure."""
         return self.spec.declared_structure(None, self.measure)
 
-    def changed(self, spec: Spec) -> MotionJob:
+    def with_spec(self, spec: Spec) -> MotionJob:
         assert spec.motion is not None
         motion = spec.motion.declared(spec.data.inputs, spec.data.outputs)
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
@@ -154,7 +154,7 @@ def _check_choices(spec: Spec, motion: Motion) -> None:
         check_motion_choices(motion, learner, structure, criterion, solver)
         given, validated = spec.training.regularization, spec.data.validation is not None
         conditions = {"linear": False, "validated": validated, "learner": learner}
-        choices = tried(given, solver, criterion, structure, **conditions)
+        choices = choose_regularizations(given, solver, criterion, structure, **conditions)
         check_solver(solver, criterion, choices)
     except KeyedError as error:
         raise InputError(f"'{_place(error)}'{error.words}.") from None
@@ -192,6 +192,6 @@ def _measure_of(spec: Spec, problem: MotionProblem, folder: Path) -> Measure:
     names = [str(lag) for lag in layout_of(problem.motion)]
     measure = spec.declared_measure(MeasurePlace(folder, names, problem.record, problem.first_row))
     rows = len(problem.record)  # a measure may weigh each of them
-    x, u = (np.resize(part.T, (rows, len(part))) for part in problem.looked_at)
+    x, u = (np.resize(part.T, (rows, len(part))) for part in problem.guessed_points)
     measure.points(Support.of_motion(problem.motion, x, u))
     return measure

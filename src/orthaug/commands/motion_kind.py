@@ -41,12 +41,12 @@ _NOT_RICH = Warning(
 )
 
 
-def checked(job: MotionJob) -> CheckResult:
+def check(job: MotionJob) -> CheckResult:
     """Return identifiability, what the learner could imitate, substeps and holds."""
     from orthaug.analysis.absorbed import Waves
     from orthaug.analysis.imitation import imitation_before
     from orthaug.analysis.input_timing import dead_times, try_holds
-    from orthaug.analysis.motion_identifiability import identified, ill_conditioned_alone
+    from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
@@ -56,7 +56,7 @@ def checked(job: MotionJob) -> CheckResult:
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
     segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
-    identification = identified(segmented)
+    identification = identify_ranks(segmented)
     if identification is None:
         wild = "".join(
             f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
@@ -136,7 +136,7 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
-def refused(job: MotionJob, result: CheckResult) -> InputError | None:
+def refusal(job: MotionJob, result: CheckResult) -> InputError | None:
     """Return an error where the outputs do not identify the parameters, after the report."""
     found = result.excitation
     if found.rank == found.columns:
@@ -179,7 +179,7 @@ def content(
     if fit.status.ok:
         plain = fit
         fit = attempt("the robust covariance", lambda: robust_free_run(plain), warnings, plain)
-        found = _analysed(job, fit, responses[job.train.name][1], warnings)
+        found = _analyse(job, fit, responses[job.train.name][1], warnings)
         warnings += closed_loop(job.train.record)
         fields |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
@@ -211,7 +211,7 @@ def content(
     }
 
 
-def _analysed(
+def _analyse(
     job: MotionJob, fit: MotionEstimate, free_run: Response, warnings: list[Any]
 ) -> dict[str, Any]:
     """Return the analyses of a fit; None for one that fails.

@@ -10,11 +10,11 @@ from typing import Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest
-from orthaug._base.lines import counted
+from orthaug._base.lines import plural
 from orthaug._base.memory import few_arenas
 from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
-from orthaug.data.clock import DRIFT, read_clock, thinned_twice
+from orthaug.data.clock import DRIFT, read_clock, thinned_fault
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
@@ -111,7 +111,7 @@ def long_stretches(
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
             f"{record.experiments[0].source}: {what}the longest stretch between missing "
-            f"samples has {counted(most, 'row')}, too few: {needed}."
+            f"samples has {plural(most, 'row')}, too few: {needed}."
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)
@@ -120,13 +120,13 @@ def long_stretches(
     )
     return kept, (
         f"{record.missing} {lost} left out with all windows that touch them; "
-        f"{counted(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
+        f"{plural(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
     )
 
 
 def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
     """Return training, validation and test parts of the spec at `path`, unprepared."""
-    files = [path.parent / file for file in expanded(path, spec.data.train.files, "train")]
+    files = [path.parent / file for file in expand_files(path, spec.data.train.files, "train")]
     stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
     train = _load(path, spec, spec.data.train, "train", stays=stays)
     validation = (
@@ -139,7 +139,7 @@ def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, .
     return train, validation, tuple(tests)
 
 
-def expanded(path: Path, entries: Sequence[str], name: str) -> list[str]:
+def expand_files(path: Path, entries: Sequence[str], name: str) -> list[str]:
     """Return the files that the spec names, sorted.
 
     A pattern such as `runs/*.parquet`, or a folder, gives all files in it.
@@ -182,13 +182,13 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         raise InputError(
             f"{path}: 'data.{name}.columns': '{unknown[0]}' is neither an input nor an output."
         )
-    files = expanded(path, part.files, name)
+    files = expand_files(path, part.files, name)
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
         return _open_in_files(path, spec, part, name, files)
     records, results = [], []
     used = _used_columns(spec, part.columns)
     for file in files:
-        fault = thinned_twice(path.parent / file, spec.data.sampling_time, part.every, used)
+        fault = thinned_fault(path.parent / file, spec.data.sampling_time, part.every, used)
         if fault:
             raise InputError(f"{path}: data.{name}: {fault}")
         record = read_record(

@@ -17,7 +17,7 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
-from orthaug.commands.signals import WATCH, ending
+from orthaug.commands.signals import WATCH, ending_message
 
 if TYPE_CHECKING:
     from orthaug.reports.fields import Content
@@ -57,10 +57,10 @@ class ListOptionCommand(typer.core.TyperCommand):
             name: option for name, option in valued.items() if not getattr(option, "is_flag", False)
         }
         lists = {name for name, option in valued.items() if getattr(option, "multiple", False)}
-        return super().parse_args(ctx, _repeated(args, lists, set(valued)))
+        return super().parse_args(ctx, _repeat_options(args, lists, set(valued)))
 
 
-def _repeated(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
+def _repeat_options(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:
     """Return arguments with the option of a list repeated before each of its values.
 
     Where the command would have no argument, one value is left for it: a file that exists, or the
@@ -167,7 +167,7 @@ def main() -> None:
         _fail(f"training failed: {error}", 1)
     except (Interrupted, KeyboardInterrupt) as interrupt:
         during, then = (*map(str, interrupt.args), "", "")[:2]
-        _fail(ending("interrupted", during, then=then), 130)
+        _fail(ending_message("interrupted", during, then=then), 130)
     except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)

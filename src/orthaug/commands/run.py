@@ -374,7 +374,7 @@ def open_ahead(
     )
 
 
-def observed(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
+def observe_outputs(opened: ModelOnData, horizon: int) -> tuple[Response, list[str]]:
     """Return the prediction `horizon` steps ahead from an observer's state, and notes."""
     from orthaug.analysis.observer import Observer
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeV
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
 from orthaug._base.checks import nearest
-from orthaug._base.errors import KeyedError, cut
+from orthaug._base.errors import KeyedError, shorten
 from orthaug._base.registry import Key, OneOf, Option, Registry, SpecLimit
 from orthaug.physics.parameters import PhysicalParameter
 
@@ -96,7 +96,7 @@ def _field(key: Key) -> tuple[Any, Any]:
     """
     if key.default is MISSING:
         return Union[_in_file(key.annotation), None], None  # noqa: UP007  (the parts are known at run time only)
-    return _in_file(key.annotation), _thawed(key.default)
+    return _in_file(key.annotation), _thaw(key.default)
 
 
 def _in_file(annotation: Any) -> Any:
@@ -129,14 +129,12 @@ def _in_file(annotation: Any) -> Any:
     return Annotated[float, Field(allow_inf_nan=False)] if annotation is float else annotation
 
 
-def _thawed(value: Any) -> Any:
+def _thaw(value: Any) -> Any:
     """Return a value with tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
-        return [_thawed(item) for item in value]
+        return [_thaw(item) for item in value]
     return (
-        {name: _thawed(item) for name, item in value.items()}
-        if isinstance(value, Mapping)
-        else value
+        {name: _thaw(item) for name, item in value.items()} if isinstance(value, Mapping) else value
     )
 
 
@@ -165,10 +163,10 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
         return f"'{key}': {text}" if key else text
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
     expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
-    return f"'{key}': found {_shown(given)}; expected {expected}"
+    return f"'{key}': found {_file_text(given)}; expected {expected}"
 
 
-def _shown(value: Any) -> str:
+def _file_text(value: Any) -> str:
     """Return a value as the file writes it, cut where it is long."""
     try:
         text = (
@@ -178,7 +176,7 @@ def _shown(value: Any) -> str:
         )
     except RecursionError:
         return "what is nested too deeply"
-    return cut(text)
+    return shorten(text)
 
 
 def _plain(message: str) -> str:

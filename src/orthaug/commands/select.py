@@ -12,7 +12,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug.commands.chosen_rows import cut, parts_of
+from orthaug.commands.chosen_rows import parts_of, split_rows
 from orthaug.commands.data_sections import EngineSection, engine_of
 from orthaug.commands.folder import relative
 from orthaug.commands.lagged_job import LaggedJob, open_lagged
@@ -84,7 +84,7 @@ def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) 
     section, began = spec.selection, time.monotonic()
     options: dict[str, Any] = {
         "learner": _learner(spec),
-        "lags": _largest(spec),
+        "lags": _largest_orders(spec),
         "criterion": _criterion(spec),
         "widths": section.hidden or WIDTHS,
         "most": MOST if section.terms is None else section.terms,
@@ -137,7 +137,7 @@ def _learner(spec: Spec) -> Learner | None:
     return declared.resolve(None) if hasattr(declared, "resolve") else declared
 
 
-def _largest(spec: Spec) -> Lags | None:
+def _largest_orders(spec: Spec) -> Lags | None:
     """Return the largest orders: of [selection], or of [lags]."""
     section, lags = spec.selection, spec.lags
     if section.na is None and section.nb is None and section.nk is None:
@@ -174,7 +174,7 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
             "matter": list(test.matter),
             "text": str(test),
         },
-        "learner": _declared(learner),
+        "learner": _learner_section(learner),
         "focus": CRITERIA.kind_of(selection.criterion),
         "terms": [
             {
@@ -191,7 +191,7 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
         or None,
         "intervals": selection.intervals,
         "level": selection.level,
-        "physics": physics and [_moved(shift) for shift in physics.shifts],
+        "physics": physics and [_shift_entry(shift) for shift in physics.shifts],
         "condition": physics and physics.condition,
         "models": selection.table.to_dict("records"),
         "seconds": seconds,
@@ -201,7 +201,7 @@ def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResul
     return SelectResult.model_validate(content)
 
 
-def _moved(shift: Shift) -> dict[str, Any]:
+def _shift_entry(shift: Shift) -> dict[str, Any]:
     own = {
         "parameter": shift.parameter,
         "unit": shift.unit,
@@ -217,7 +217,7 @@ def _moved(shift: Shift) -> dict[str, Any]:
     return own | values
 
 
-def _declared(learner: Learner | None) -> dict[str, Any] | None:
+def _learner_section(learner: Learner | None) -> dict[str, Any] | None:
     """Return the section [learner] of a choice."""
     if learner is None:
         return None
@@ -235,7 +235,10 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, parts: Parts) 
     path = job.path
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
     _rebase(document, path.parent, folder)
-    learner, orders = _declared(selection.learner), selection.reach or selection.orders.chosen
+    learner, orders = (
+        _learner_section(selection.learner),
+        selection.reach or selection.orders.chosen,
+    )
     document["lags"] = tomlkit.item({"na": orders.na, "nb": list(orders.nb), "nk": list(orders.nk)})
     document["learner"] = tomlkit.item(learner or {"kind": "none"})
     if learner is not None and "terms" in learner:
@@ -264,7 +267,8 @@ def _say_rows(
     if selection.learner is None or parts.intervals is CONDITIONAL:
         return
     chosen, fitted = (
-        {**one.declared, "files": _from(folder, job, one.files)} for one in cut(job, parts)
+        {**one.declared, "files": _relative_files(folder, job, one.files)}
+        for one in split_rows(job, parts)
     )
     if parts.fitted is not parts.chooses:
         document["data"]["train"].update(fitted)
@@ -274,7 +278,7 @@ def _say_rows(
     section["chosen_on"].comment("where `data.train` has rows of these, a fit has no intervals")
 
 
-def _from(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
+def _relative_files(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
     """Return files of the job's spec as seen from another folder."""
     old = job.path.parent
     return [file if Path(file).is_absolute() else relative(old / file, folder) for file in files]

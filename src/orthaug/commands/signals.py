@@ -26,11 +26,11 @@ _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "ended wit
 _PATIENCE = 0.5  # s for a progress bar to leave the terminal as it was
 
 
-def _nothing() -> str:
+def _no_text() -> str:
     return ""
 
 
-def ending(words: str, during: str, kept: str = "", then: str = "") -> str:
+def ending_message(words: str, during: str, kept: str = "", then: str = "") -> str:
     """Return the message of an early end: what was stopped, what is written, how to continue."""
     return (
         f"{words}{during and f' during {during}'}; {kept or 'nothing'} is "
@@ -46,8 +46,8 @@ class SignalWatch:
 
     def __init__(self) -> None:
         self.active = self.ending = False
-        self._during: Callable[[], str] = _nothing
-        self._stop: Callable[[], Any] = _nothing
+        self._during: Callable[[], str] = _no_text
+        self._stop: Callable[[], Any] = _no_text
         self._then = ""
         self._asked: threading.Event | None = None
 
@@ -69,19 +69,19 @@ class SignalWatch:
         _thread.start_new_thread(self._wait, (reader,))
 
     @contextmanager
-    def reporting(
-        self, during: Callable[[], str], stop: Callable[[], Any] = _nothing, then: str = ""
+    def report_stop(
+        self, during: Callable[[], str], stop: Callable[[], Any] = _no_text, then: str = ""
     ) -> Iterator[None]:
         """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""
         self._during, self._stop, self._then = during, stop, then
         try:
             yield
         finally:
-            self._during = self._stop = _nothing
+            self._during = self._stop = _no_text
             self._then = ""
 
     @contextmanager
-    def asking(self) -> Iterator[threading.Event]:
+    def ask_to_stop(self) -> Iterator[threading.Event]:
         """Yield an event that the first Ctrl-C sets, for work that can stop with a partial result.
 
         A second one ends the program.
@@ -117,7 +117,7 @@ class SignalWatch:
                 partials.discard_all()
             kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())
             self._stop_drawing()
-            line = ending(words, during, kept, self._then) + "\n"
+            line = ending_message(words, during, kept, self._then) + "\n"
             with suppress(OSError):
                 os.write(
                     2,
@@ -129,7 +129,7 @@ class SignalWatch:
             os._exit(128 + number)
 
     def _stop_drawing(self) -> None:
-        if self._stop is _nothing:
+        if self._stop is _no_text:
             return
         done = _thread.allocate_lock()
         done.acquire()

@@ -35,7 +35,7 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
-from orthaug.fitting.rules import check_solver, check_starts, tried
+from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
@@ -389,7 +389,7 @@ class Spec(Section):
 
     @property
     def brought(self) -> bool:
-        """Whether training reads all rows into memory."""
+        """True if training reads all rows into memory."""
         free_run = self.declared_criterion().free_run
         return self.motion is not None or (free_run is not None and not free_run.steps)
 
@@ -404,7 +404,7 @@ class Spec(Section):
             self.declared_structure(kind),
         )
         conditions: dict[str, Any] = {"linear": linear, "validated": validated}
-        return tried(
+        return choose_regularizations(
             given,
             *declared,
             **conditions,
@@ -413,7 +413,7 @@ class Spec(Section):
         )
 
     def runs(self, *, linear: bool) -> int:
-        """Number of runs in a fit: restarts times regularizations."""
+        """Return the number of runs in a fit: restarts times regularizations."""
         validated = self.data.validation is not None
         return self.training.restarts * len(
             self.regularizations(linear=linear, validated=validated)

@@ -149,7 +149,7 @@ def _split_lagged(
     model: Model, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.inference.covariance import interval
-    from orthaug.inference.splitting import split_under
+    from orthaug.inference.splitting import split_by_measure
 
     parameters = model.form.baseline.parameters
     bounded = [
@@ -161,7 +161,7 @@ def _split_lagged(
             "bound, or with `fixed = true` there."
         )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
-    under = split_under(measure, model, support, model.statistics.joint(len(model.theta)))
+    under = split_by_measure(measure, model, support, model.statistics.joint(len(model.theta)))
     std = None if under.covariance is None else np.sqrt(np.diag(under.covariance))
     ci = None if std is None else interval(under.theta, std, model.statistics.freedom)
     return SplitResult.model_validate(
@@ -179,9 +179,9 @@ def _split_lagged(
 def _split_motion(
     model: MotionModel, record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
-    from orthaug.fitting.motion_estimation import reopened
+    from orthaug.fitting.motion_estimation import reopen_estimate
 
-    fit = reopened(model, record).split(measure)
+    fit = reopen_estimate(model, record).split(measure)
     split, (parameters, values) = fit.split_by, fit.model.estimated
     lacking = fit.std is None and split.slope is not None
     return SplitResult.model_validate(

@@ -62,7 +62,7 @@ def plain(error: UnicodeError) -> tuple[str, int]:
         raise error
     missing = error.object[error.start : error.end]
     is_json = error.object.startswith("{")
-    return "".join(_escaped(letter) if is_json else _plain(letter) for letter in missing), error.end
+    return "".join(_escape(letter) if is_json else _plain(letter) for letter in missing), error.end
 
 
 def _plain(letter: str) -> str:
@@ -76,7 +76,7 @@ def _plain(letter: str) -> str:
     return text or letter.encode("ascii", "backslashreplace").decode()
 
 
-def _escaped(letter: str) -> str:
+def _escape(letter: str) -> str:
     """Return a letter as JSON writes it: two escapes for one beyond 16 bits."""
     units = letter.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))

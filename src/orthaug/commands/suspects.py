@@ -8,11 +8,12 @@ from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspect
 from orthaug.analysis.suspects import WIDTHS, Suspect, data_width, suspect_columns
 from orthaug.commands.spec import SuspectSection
 from orthaug.data.expressions import SAMPLING_TIME
+from orthaug.inference.measures import WeighedPhysics
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.problem import Problem
 
 
-def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
+def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
     """Return the suspects of a spec.
 
     A width that is not given is the median size of what the term acts on.
@@ -39,10 +40,18 @@ def declared(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Susp
     return tuple(suspects)
 
 
-def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
-    """Raise InputError for suspects that cannot be read, or have no value on some training row."""
-    own = (problem.rows.x, problem.layout, problem.outputs, problem.lengths)
-    suspect_columns(declared(sections, problem), *own)
+def check_suspects(
+    sections: Sequence[SuspectSection], problem: Problem, weighed: WeighedPhysics
+) -> None:
+    """Raise InputError for suspects that cannot be read or have no value.
+
+    They need one on every training row, and one with memory at the points of the measure.
+    """
+    suspects = declare_suspects(sections, problem)
+    suspect_columns(suspects, problem.rows.x, problem.layout, problem.outputs, problem.lengths)
+    if weighed.points.x is not problem.rows.x:
+        hidden = [suspect for suspect in suspects if suspect.memory is not None]
+        suspect_columns(hidden, weighed.points.x[:1], problem.layout, problem.outputs)
 
 
 def declared_terms(
@@ -54,7 +63,7 @@ def declared_terms(
         InputError: an unknown kind, equation or name, an expression that cannot be read or has no
             value.
     """
-    suspects, (x, u) = [], problem.looked_at
+    suspects, (x, u) = [], problem.guessed_points
     for section in sections:
         kept = ("time_constant", "factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}

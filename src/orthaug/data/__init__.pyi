@@ -1,8 +1,5 @@
 from .dask_source import open_frame as open_frame
 from .parquet_source import open_parquet as open_parquet
-from .preparation import Decimate as Decimate
-from .preparation import Highpass as Highpass
-from .preparation import Lowpass as Lowpass
 from .preparation import prepare as prepare
 from .readers import read_record as read_record
 from .record import Channel as Channel
@@ -13,4 +10,3 @@ from .steps import Detrend as Detrend
 from .steps import Fill as Fill
 from .steps import Outliers as Outliers
 from .steps import Resample as Resample
-from .steps import Shift as Shift

@@ -133,7 +133,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
         if fault is not None and not column.constant:
             refused.append(fault)
         elif fault is None and clock.column is None:
-            clock = _ticking(
+            clock = _column_clock(
                 column, column.values if dates else in_seconds(column.values, column.header)
             )
         elif fault is None and not dates:
@@ -145,7 +145,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
             continue
         verdict = _resemblance(column)
         if verdict is None and clock.column is None and column.filled == rows:
-            clock = _ticking(column, in_seconds(column.values, column.header))
+            clock = _column_clock(column, in_seconds(column.values, column.header))
         elif verdict is None:
             refused.append(
                 RefusedColumn(
@@ -252,7 +252,7 @@ def read_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
     return clock if clock.column else by_single_number(path)
 
 
-def thinned_twice(
+def thinned_fault(
     path: Path, sampling_time: float | None, every: int, apart: Collection[str]
 ) -> str:
     """Return the fault of a sampling time that is that of the kept rows, not of the file's rows.
@@ -293,7 +293,7 @@ def by_single_number(path: Path) -> Clock:
     return Clock(step, Column(name, name, "", np.array([found[name]])))
 
 
-def _ticking(column: Column, seconds: Vector) -> Clock:
+def _column_clock(column: Column, seconds: Vector) -> Clock:
     steps = np.diff(seconds[np.isfinite(seconds)])
     usual = float(np.median(steps))
     even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())

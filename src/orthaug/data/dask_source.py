@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step
-from orthaug.data.sources import joined, stretches
+from orthaug.data.sources import join_pieces, stretches
 
 _NAME = "the DataFrame"
 _HISTORY = 10_000  # rows of the partition before that are kept beside each: no lag is larger
@@ -138,7 +138,7 @@ class FrameSource:
                 frame = self.client.submit(_rows, partition.held[0], a, b, pure=False).result()
                 shown = replace(partition, first_row=partition.first_row + a, rows=b - a, held=())
                 found += FramePartitionData(shown, frame, None).pieces(0)
-        return joined(found)
+        return join_pieces(found)
 
 
 def open_frame(

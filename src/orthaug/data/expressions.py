@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import nearest
-from orthaug._base.errors import LONGEST, InputError, shown
+from orthaug._base.errors import LONGEST, InputError, show
 
 
 class Lag(NamedTuple):
@@ -189,7 +189,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
     """
     constants = dict(constants or {})
     if not isinstance(text, str):
-        raise InputError(f"an expression must be text such as 'y[k-1]'; got {shown(text)}.")
+        raise InputError(f"an expression must be text such as 'y[k-1]'; got {show(text)}.")
     text = " ".join(text.split())
     if not text:
         raise InputError("An expression is empty; write for example y[k-1], or 1 for an offset.")
@@ -235,7 +235,7 @@ def parse_named(
     """
     if not isinstance(text, str):
         raise InputError(
-            f"{where} must be an expression in text such as 'Ts**2 / m'; got {shown(text)}."
+            f"{where} must be an expression in text such as 'Ts**2 / m'; got {show(text)}."
         )
     if "[" in text:
         raise InputError(
@@ -268,7 +268,7 @@ def _read(text: str, constants: Mapping[str, float]) -> Expression:
 def _suggest(text: str, constants: Mapping[str, float]) -> None:
     """Raise InputError with the correct text for one that is written as in MATLAB."""
 
-    def lagged(found: re.Match[str]) -> str:
+    def lag_text(found: re.Match[str]) -> str:
         name, lag = found[1] or found[3], found[2] or found[4] or ""
         return found[0] if name in FUNCTIONS else f"{name}[k{lag.replace(' ', '')}]"
 
@@ -276,7 +276,7 @@ def _suggest(text: str, constants: Mapping[str, float]) -> None:
     for pattern, written, sentence in (
         (_POWER, "**", "a power is **"),
         (_ELEMENTWISE, r"\1", "products and quotients are * and /"),
-        (_LAGGED, lagged, "a channel at a lag has square brackets and the index k"),
+        (_LAGGED, lag_text, "a channel at a lag has square brackets and the index k"),
     ):
         changed = pattern.sub(written, ours)
         said, ours = ([*said, sentence] if changed != ours else said), changed
@@ -293,7 +293,7 @@ def _check(node: ast.AST, text: str, constants: Mapping[str, float], used: set[s
     """Walk the tree once; raise InputError at the first node that is not on the list."""
     if isinstance(node, ast.Constant):
         if isinstance(node.value, bool) or not isinstance(node.value, int | float):
-            raise InputError(f"'{text}': {shown(node.value)} is not a number.")
+            raise InputError(f"'{text}': {show(node.value)} is not a number.")
         try:
             finite = math.isfinite(float(node.value))
         except OverflowError:

@@ -116,7 +116,7 @@ def in_seconds(values: Vector, header: str) -> Vector:
     return values / round(1 / unit) if unit < 1 else values * unit  # 20 ms are the double 0.02
 
 
-def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
+def parse_dates(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
     """Return dates as seconds since the first of them, NaN where a cell is none.
 
     None where they are no dates.
@@ -142,7 +142,7 @@ def dated(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
     if kind == "M":
         return _since_first(found)
     filled = found.notna() & (found != "")
-    parsed = _parsed(found[filled], where) if filled.any() else None
+    parsed = _read_dates(found[filled], where) if filled.any() else None
     return None if parsed is None else _since_first(parsed.reindex(found.index))
 
 
@@ -160,7 +160,7 @@ def _since_first(instants: Any) -> Vector:
     return (instants - there.iloc[0]).dt.total_seconds().to_numpy(dtype=float)
 
 
-def _parsed(cells: Any, where: str) -> Any:
+def _read_dates(cells: Any, where: str) -> Any:
     """Read ISO 8601, then day, month and year as people write them.
 
     None where most cells are neither.

@@ -19,7 +19,7 @@ from xml.etree.ElementTree import iterparse
 
 import numpy as np
 
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.memory import check_memory
 
 _REMARK = ("#", "%")  # lines above the header that begin so
@@ -132,7 +132,7 @@ def encoding_of(path: Path) -> str:
     return _FALLBACK
 
 
-def guessed_at(path: Path) -> int | None:
+def first_foreign_line(path: Path) -> int | None:
     """Return the first line of a text that is no UTF-8, so that it is read as Windows-1252.
 
     None where none is.
@@ -186,7 +186,7 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
         columns and set(columns) <= {cell.strip() for cell in rows[first][0]}
     ):
         return Layout(
-            _unnamed([cells for cells, _ in rows[first:]]),
+            _default_names([cells for cells, _ in rows[first:]]),
             rows[first][1] - 1,
             separator,
             encoding,
@@ -249,7 +249,7 @@ def _counts_columns(rows: list[tuple[list[str], int]], separator: str) -> bool:
     return not (len(steps) > 1 and steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6))
 
 
-def _unnamed(rows: list[list[str]]) -> list[str]:
+def _default_names(rows: list[list[str]]) -> list[str]:
     """Return the names x1, x2, … for the columns of rows.
 
     None for those behind the last that holds anything.
@@ -405,7 +405,7 @@ def _check_order(path: Path, sheet: Any) -> None:
                 before, row, column = row, int(element.get("r", row + 1)), 0
                 if not before < row <= _ROWS:
                     raise InputError(
-                        f"{path}: the rows of the sheet are out of order at row {shown(row)}."
+                        f"{path}: the rows of the sheet are out of order at row {show(row)}."
                     )
             elif event == "start" and kind == "c":
                 place = element.get("r")

@@ -125,7 +125,7 @@ def read_mat5(content: bytes, path: object) -> dict[str, Variable]:
     while at < len(whole):
         kind, data, at = _element(whole, at, order)
         if kind == _COMPRESSED:
-            kind, data, body = _inflated(data, order, path)
+            kind, data, body = _inflate(data, order, path)
         else:
             body = lambda data=data: data  # noqa: E731
         if kind != _MATRIX:
@@ -151,7 +151,7 @@ def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, in
     return kind, data[begin : begin + size], end
 
 
-def _inflated(
+def _inflate(
     data: memoryview, order: str, path: object
 ) -> tuple[int, memoryview, Callable[[], memoryview]]:
     """Return type, first bytes, and a function for all bytes of a compressed element."""

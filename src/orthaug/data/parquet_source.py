@@ -27,7 +27,7 @@ from orthaug.data.record import (
     check_step,
     same_step,
 )
-from orthaug.data.sources import joined, stretches
+from orthaug.data.sources import join_pieces, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
 BATCH_ROWS = 32_768  # rows that are built at once: several such blocks are in memory
@@ -179,7 +179,7 @@ class ParquetSource:
                 shift = partition.start - before
                 found += partition.between(a + shift, b + shift, 0)
         step = self.sampling_time
-        return [replace(e, start_time=e.start_time + step * e.offset) for e in joined(found)]
+        return [replace(e, start_time=e.start_time + step * e.offset) for e in join_pieces(found)]
 
     def check_unchanged(self) -> None:
         """Raise InputError where a file is not the one that was opened."""
@@ -203,13 +203,17 @@ def open_parquet(
 
     Rows, columns and their types, experiments and the sampling time are read.
 
-    Args: paths: of the files, in order; none of them reaches into the next. inputs, outputs:
-        channel names, or `Channel`s with column, unit, scale and offset. sampling_time: seconds
-        between rows; or `time`, the column that holds the instants. experiment: a column of whole
-        numbers that labels the experiments within a file; None for one a file. columns: the files'
-        column for a channel, `{"position": "yVal"}`. missing: "error", or "skip" to end a stretch
-        at rows with a missing sample. partition_rows: rows of a partition at least; row groups are
-        never cut.
+    Args:
+        paths: the files, in order; none of them reaches into the next.
+        inputs: channel names, or `Channel`s with column, unit, scale and offset.
+        outputs: as `inputs`.
+        sampling_time: seconds between rows.
+        time: the column that holds the instants, instead of `sampling_time`.
+        experiment: a column of whole numbers that labels the experiments within a file; None for
+            one a file.
+        columns: the files' column for a channel, `{"position": "yVal"}`.
+        missing: "error", or "skip" to end a stretch at rows with a missing sample.
+        partition_rows: rows of a partition at least; row groups are never cut.
 
     Raises:
         InputError: a file that cannot be read, has no rows, lacks a column or holds another type in
@@ -239,7 +243,7 @@ def open_parquet(
             runs, step = _look(file, path, total, time, experiment)
         if step is not None:
             steps.append((path, step))
-        for start, stop in _grouped(groups, partition_rows):
+        for start, stop in _group_rows(groups, partition_rows):
             partitions.append(
                 RowGroups(str(path), start, stop, runs.within(start, stop), reading, stamp)
             )
@@ -310,7 +314,7 @@ def _look(
             else found.seconds(batch.column(time).to_numpy(zero_copy_only=False))
         )
         found.add(instants, None if experiment is None else _numbers(batch, experiment))
-    return found.ended()
+    return found.end_scan()
 
 
 class _BatchScan:
@@ -393,7 +397,7 @@ class _BatchScan:
         if inside.sum() >= _FEWEST_STEPS:
             self.rates.append(float(np.nanmean(steps)))
 
-    def ended(self) -> tuple[Runs, float | None]:
+    def end_scan(self) -> tuple[Runs, float | None]:
         ranges = tuple(zip(self.begins, [*self.begins[1:], self.rows], strict=True))
         if self.time is None:
             return Runs(ranges, (0.0,) * len(ranges)), None
@@ -410,7 +414,7 @@ class _BatchScan:
         return Runs(ranges, tuple(self.began)), step
 
 
-def _grouped(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
+def _group_rows(groups: Sequence[int], least: int) -> Iterator[tuple[int, int]]:
     """Return row ranges of partitions: row groups joined until there are `least` rows."""
     start = stop = 0
     for rows in groups:

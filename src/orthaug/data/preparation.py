@@ -10,7 +10,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 
 from orthaug._base.checks import Matrix, check_type
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.registry import OneOf, Registry, check_fields
 from orthaug.data.prepared import Prepared
 from orthaug.data.record import Experiment, Record, same_step, unbroken
@@ -25,7 +25,7 @@ _ANTI_ALIAS, _RIPPLE, _CORNER = (
 Phase = Annotated[str, OneOf(("zero", "causal"))]
 
 
-def _filtered(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
+def _filter_stretches(values: Matrix, sections: Matrix, phase: str, what: str) -> Matrix:
     """Filter every stretch without a gap; samples of stretches that are too short are missing."""
     from scipy.signal import sosfilt, sosfilt_zi, sosfiltfilt
 
@@ -63,9 +63,9 @@ class _Butterworth:
     def __post_init__(self) -> None:
         check_fields(self)
         if self.order > 10:
-            raise InputError(f"`order` must be at most 10; got {shown(self.order)}.")
+            raise InputError(f"`order` must be at most 10; got {show(self.order)}.")
 
-    def _through(self, run: Run, kind: str) -> Run:
+    def _filter_run(self, run: Run, kind: str) -> Run:
         from scipy.signal import butter
 
         run.check_even(f"`{kind}`")
@@ -77,8 +77,8 @@ class _Butterworth:
             )
         columns = run.columns(self.channels)
         sections = np.asarray(butter(self.order, self.cutoff / nyquist, kind, output="sos"))
-        return run.holding(
-            columns, _filtered(run.values[:, columns], sections, self.phase, f"`{kind}`")
+        return run.with_values(
+            columns, _filter_stretches(run.values[:, columns], sections, self.phase, f"`{kind}`")
         )
 
 
@@ -101,7 +101,7 @@ class Lowpass(_Butterworth):
     """
 
     def apply(self, run: Run) -> Run:
-        return self._through(run, "lowpass")
+        return self._filter_run(run, "lowpass")
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Highpass(_Butterworth):
     """
 
     def apply(self, run: Run) -> Run:
-        return self._through(run, "highpass")
+        return self._filter_run(run, "highpass")
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Decimate:
 
         run.check_even("`decimate`")
         sections = np.asarray(cheby1(_ANTI_ALIAS, _RIPPLE, _CORNER / self.factor, output="sos"))
-        values = _filtered(run.values, sections, self.phase, "`decimate`")[:: self.factor]
+        values = _filter_stretches(run.values, sections, self.phase, "`decimate`")[:: self.factor]
         kept = replace(
             run, values=values, instants=run.instants[:: self.factor], step=run.step * self.factor
         )
@@ -262,7 +262,7 @@ def prepared_experiments(
         raise InputError(
             f"after preparation samples are {apart} apart; give one `sampling_time` in `resample`."
         )
-    return tuple(found), sampling[0], tuple(account.prepared() for account in done), lost
+    return tuple(found), sampling[0], tuple(account.prepare() for account in done), lost
 
 
 @dataclass(eq=False)
@@ -280,7 +280,7 @@ class _Account:
             self.marked += int((old & ~new).sum())
             self.filled += int((new & ~old).sum())
 
-    def prepared(self) -> Prepared:
+    def prepare(self) -> Prepared:
         return Prepared(self.kind, _options_of(self.step), self.marked + self.filled)
 
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
-from orthaug._base.errors import InputError, MissingSampleError, shown
-from orthaug._base.lines import counted
-from orthaug.data.clock import DRIFT, JITTER, thinned_twice
+from orthaug._base.errors import InputError, MissingSampleError, show
+from orthaug._base.lines import plural
+from orthaug.data.clock import DRIFT, JITTER, thinned_fault
 from orthaug.data.layouts import text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import (
@@ -62,11 +62,14 @@ def read_record(
 ) -> Record:
     r"""Read one file; several row ranges are experiments of their own.
 
-    Args: path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
-        inputs, outputs: channel names, or `Channel`s with column, unit, scale and offset.
-        sampling_time: seconds between rows; or `time`, the column that holds the instants: numbers
-        in the unit of its
-            header (`t [ms]`; s without one), or dates, which count from the first row of the file.
+    Args:
+        path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
+        inputs: channel names, or `Channel`s with column, unit, scale and offset.
+        outputs: as `inputs`.
+        sampling_time: seconds between rows.
+        time: the column that holds the instants, instead of `sampling_time`: numbers in the unit of
+            its header (`t [ms]`; s without one), or dates, which count from the first row of the
+            file.
         rows: half-open range `(start, stop)` of data rows, or several; None for all.
         every: keep each n-th row (no filter); the sampling time is multiplied, so it is that of the
             file's rows.
@@ -101,7 +104,7 @@ def read_record(
     )
     if not column_of:
         raise InputError("no channels are asked for; name inputs, outputs or both.")
-    if fault := thinned_twice(path, sampling_time, every, wanted):
+    if fault := thinned_fault(path, sampling_time, every, wanted):
         raise InputError(f"{path}: {fault}")
     table = _trim(read_table(path, wanted, time or None), uneven=missing != "error")
     needed = wanted
@@ -110,11 +113,11 @@ def read_record(
     total = len(next(iter(table.columns.values())))
     experiments, steps, recorded = [], [], 0
     ranges = _ranges(rows, total, path)
-    ranges = ranges if experiment is None else _labelled(table, experiment, ranges)
+    ranges = ranges if experiment is None else _split_by_label(table, experiment, ranges)
     if prepare:
         return _RawRanges(
             table, channels, column_of, time, sampling_time or 1.0, every, missing
-        ).prepared(prepare, ranges)
+        ).prepare(prepare, ranges)
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
@@ -164,7 +167,7 @@ class _RawRanges:
     every: int
     missing: str
 
-    def prepared(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
+    def prepare(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
         """Return the record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
@@ -175,7 +178,7 @@ class _RawRanges:
         )
         if lost and self.missing == "error":
             lacking = (
-                f"{counted(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
+                f"{plural(lost, 'row')} {'lacks' if lost == 1 else 'lack'} a sample after "
                 "preparation"
             )
             raise MissingSampleError(
@@ -284,7 +287,7 @@ def _columns(channels: Sequence[Sequence[Channel]], columns: Any) -> dict[str, s
     for name, column in given.items():
         if not isinstance(column, str):
             raise InputError(
-                f"`columns`: the column of {shown(name)} must be a name; got {shown(column)}."
+                f"`columns`: the column of {show(name)} must be a name; got {show(column)}."
             )
     return {c.name: given.get(c.name, c.file_column) for group in channels for c in group}
 
@@ -303,11 +306,11 @@ def _check_time(time: Any, sampling_time: Any, outputs: Mapping[str, str]) -> No
             )
 
 
-def _listed(value: Any) -> bool:
+def _is_list(value: Any) -> bool:
     return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
 
 
-def _whole(value: Any) -> bool:
+def _is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
 
 
@@ -317,13 +320,15 @@ def _ranges(
     """Return half-open ranges of rows, each checked against the file."""
     if rows is None:
         return [(0, total)]
-    pairs: list = list(rows) if _listed(rows) else []
-    if not any(map(_listed, pairs)):
+    pairs: list = list(rows) if _is_list(rows) else []
+    if not any(map(_is_list, pairs)):
         pairs = [pairs]
-    if not _listed(rows) or not all(_listed(pair) and all(map(_whole, pair)) for pair in pairs):
+    if not _is_list(rows) or not all(
+        _is_list(pair) and all(map(_is_whole, pair)) for pair in pairs
+    ):
         raise InputError(
             f"{path}: `rows` must be two whole numbers, [start, stop], or a list of such "
-            f"pairs; got {shown(rows)}."
+            f"pairs; got {show(rows)}."
         )
     for pair in pairs:
         if len(pair) != 2 or not 0 <= pair[0] < pair[1]:
@@ -345,7 +350,7 @@ def _ranges(
     return [(int(start), int(stop)) for start, stop in pairs]
 
 
-def _labelled(
+def _split_by_label(
     table: Table, column: str, ranges: Sequence[tuple[int, int]]
 ) -> list[tuple[int, int]]:
     """Return the ranges cut where the label of the experiment changes."""

@@ -17,7 +17,7 @@ from orthaug._base.checks import (
     check_unique,
     is_number,
 )
-from orthaug._base.errors import LONGEST, InputError, shown, visible
+from orthaug._base.errors import LONGEST, InputError, show, visible
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
 from orthaug.data.prepared import Prepared, added_up
@@ -58,7 +58,7 @@ class Channel:
     def __post_init__(self) -> None:
         if not is_name(self.name):
             raise InputError(
-                f"{_quoted(self.name)} cannot name a channel; use letters, digits and "
+                f"{_quote(self.name)} cannot name a channel; use letters, digits and "
                 f"underscores, at most {LONGEST}, not starting with a digit, and none of "
                 f"{', '.join(sorted(RESERVED))}. A column of another name is its `column`."
             )
@@ -67,7 +67,7 @@ class Channel:
         if not (is_number(self.scale) and self.scale != 0 and is_number(self.offset)):
             raise InputError(
                 f"channel '{self.name}': `scale` must be finite and not 0, `offset` finite; "
-                f"got {shown(self.scale)} and {shown(self.offset)}."
+                f"got {show(self.scale)} and {show(self.offset)}."
             )
 
     @property
@@ -81,8 +81,8 @@ class Channel:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-def _quoted(name: Any) -> str:
-    return f"'{name}'" if isinstance(name, str) else shown(name)
+def _quote(name: Any) -> str:
+    return f"'{name}'" if isinstance(name, str) else show(name)
 
 
 def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
@@ -100,7 +100,7 @@ def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
         example = given if isinstance(given, str) else "y"
         raise InputError(
             f"`{what}` must be a list of names or Channels, such as ['{example}']; got "
-            f"{shown(given)}."
+            f"{show(given)}."
         )
     return tuple(name if isinstance(name, Channel) else Channel(name) for name in given)
 
@@ -110,7 +110,7 @@ def check_step(value: Any) -> float:
     if not is_number(value) or not 0 < value <= LONGEST_STEP:
         raise InputError(
             "the sampling time must be a positive number of seconds, at most "
-            f"{LONGEST_STEP:g}; got {shown(value)}."
+            f"{LONGEST_STEP:g}; got {show(value)}."
         )
     return float(value)
 
@@ -398,7 +398,7 @@ class Record(NotebookView):
             Record(1 experiment, 20 samples, Ts = 1 s, inputs: none; outputs: y)
         """
         if not is_number(fraction) or not 0 < fraction < 1:
-            raise InputError(f"`fraction` must lie between 0 and 1; got {shown(fraction)}.")
+            raise InputError(f"`fraction` must lie between 0 and 1; got {show(fraction)}.")
         check_choice(by, ("rows", "experiments"), "`by`")
         pieces = self.experiments if by == "rows" else (self.experiments,)
         cuts = [round(fraction * len(piece)) for piece in pieces]
@@ -435,7 +435,7 @@ def _range_of(rows: Any, count: int) -> tuple[int, int]:
     if not isinstance(rows, slice):
         raise InputError(
             "a record is cut by a range of rows, such as record[100:500]; got "
-            f"record[{shown(rows)}]."
+            f"record[{show(rows)}]."
         )
     for place in (rows.start, rows.stop, rows.step):
         check_type(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import LARGEST_LAG, Expression, Lag
 from orthaug.data.record import Experiment, Record
 
@@ -66,9 +66,9 @@ def _per_channel(
             f"number, or one per {kind}."
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
-        raise InputError(f"`{key}` must be whole numbers, 0 or more; got {shown(value)}.")
+        raise InputError(f"`{key}` must be whole numbers, 0 or more; got {show(value)}.")
     if any(v > LARGEST_LAG for v in values):
-        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {shown(value)}.")
+        raise InputError(f"`{key}` must be at most {LARGEST_LAG}; got {show(value)}.")
     return [int(v) for v in values]
 
 

@@ -115,7 +115,7 @@ class RowPartition:
         return len(self.experiment) - self.start
 
     def pieces(self, lead: int) -> Iterator[Experiment]:
-        yield _later(self.experiment, max(self.start - lead, 0), None)
+        yield _slice_experiment(self.experiment, max(self.start - lead, 0), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class Span:
         return (piece for partition in self.partitions for piece in partition.pieces(lead))
 
 
-def _later(experiment: Experiment, start: int, stop: int | None) -> Experiment:
+def _slice_experiment(experiment: Experiment, start: int, stop: int | None) -> Experiment:
     """Return rows of an experiment with their offset from the start of the recording."""
     return replace(experiment.rows(start, stop), offset=experiment.offset + start)
 
@@ -209,7 +209,9 @@ class RecordSource:
             for begin in range(0, len(experiment), self.size):
                 first = max(begin - self.lead, 0)
                 held.append(
-                    RowPartition(_later(experiment, first, begin + self.size), begin - first)
+                    RowPartition(
+                        _slice_experiment(experiment, first, begin + self.size), begin - first
+                    )
                 )
         return tuple(held)
 
@@ -218,7 +220,7 @@ class RecordSource:
         for experiment in self.record.experiments:
             a, b = max(start - before, 0), min(stop - before, len(experiment))
             if a < b:
-                found.append(_later(experiment, a, b))
+                found.append(_slice_experiment(experiment, a, b))
             before += len(experiment)
         return found
 
@@ -232,7 +234,7 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
         if end - begin == len(experiment):
             yield experiment
         elif end - begin > lead:
-            yield _later(experiment, begin, end)
+            yield _slice_experiment(experiment, begin, end)
 
 
 def follows(one: Any, other: Any) -> bool:
@@ -241,7 +243,7 @@ def follows(one: Any, other: Any) -> bool:
     return ends == (other.source, other.first_row, other.offset)
 
 
-def joined(pieces: Sequence[Experiment]) -> list[Experiment]:
+def join_pieces(pieces: Sequence[Experiment]) -> list[Experiment]:
     """Return the pieces of an experiment that follow one another as one."""
     joined: list[list[Experiment]] = []
     for piece in pieces:

@@ -12,7 +12,7 @@ import numpy as np
 from annotated_types import Ge, Gt
 
 from orthaug._base.checks import Matrix, Vector, check_number, check_type, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.registry import OneOf, check_fields
 
 _MAD = 1.4826  # standard deviations of a normal variable in its median absolute deviation
@@ -60,7 +60,7 @@ class Run:
                 )
         return [self.names.index(name) for name in channels]
 
-    def holding(self, columns: list[int], values: Matrix) -> Run:
+    def with_values(self, columns: list[int], values: Matrix) -> Run:
         """Return the experiment with other values in some columns."""
         changed = self.values.copy()
         changed[:, columns] = values
@@ -107,7 +107,7 @@ class Detrend:
         check_fields(self)
         if self.degree > 1:
             raise InputError(
-                f"`degree` must be 0, the mean, or 1, a straight line; got {shown(self.degree)}."
+                f"`degree` must be 0, the mean, or 1, a straight line; got {show(self.degree)}."
             )
 
     def apply(self, run: Run) -> Run:
@@ -117,7 +117,7 @@ class Detrend:
             there = np.isfinite(values[:, j])
             if there.sum() > self.degree:
                 values[:, j] -= np.polyval(np.polyfit(t[there], values[there, j], self.degree), t)
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
 
 @dataclass(frozen=True)
@@ -158,16 +158,16 @@ class Resample:
             )
         grid = t[0] + step * np.arange(int(count))
         most = _APART * max(step, run.step)
-        at = _measured(t, grid, _SAME * step)
+        at = _snap_to_instants(t, grid, _SAME * step)
         values = np.column_stack(
-            [_between(t, column, at, self.method, most) for column in run.values.T]
+            [_interpolate(t, column, at, self.method, most) for column in run.values.T]
         )
         return replace(
             run, values=values, instants=grid, step=step, even=True, first=0, stride=1, moved=True
         )
 
 
-def _measured(t: Vector, grid: Vector, near: float) -> Vector:
+def _snap_to_instants(t: Vector, grid: Vector, near: float) -> Vector:
     """Return the grid, with a measured instant in place of one that is near it.
 
     Then no sample is lost by rounding.
@@ -177,7 +177,7 @@ def _measured(t: Vector, grid: Vector, near: float) -> Vector:
     return np.where(np.abs(closest - grid) <= near, closest, grid)
 
 
-def _between(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:
+def _interpolate(t: Vector, column: Vector, grid: Vector, method: str, most: float) -> Vector:
     """Return a channel at other instants.
 
     NaN outside of it, and between neighbours more than `most` apart.
@@ -235,7 +235,7 @@ class Outliers:
         values = run.values[:, columns].copy()
         for x in values.T:
             x[self._wild(x)] = np.nan
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
     def _wild(self, x: Vector) -> np.ndarray:
         distance, deviation = self.distances(x)
@@ -291,11 +291,11 @@ class Fill:
             there = np.flatnonzero(np.isfinite(x))
             if not len(there):
                 continue
-            guess = _between(t, x, t, self.method, np.inf)
+            guess = _interpolate(t, x, t, self.method, np.inf)
             for a, b in zip(there[:-1], there[1:], strict=True):
                 if 1 < b - a <= self.most + 1:
                     x[a + 1 : b] = guess[a + 1 : b]
-        return run.holding(columns, values)
+        return run.with_values(columns, values)
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ class Shift:
     def __post_init__(self) -> None:
         check_type(self.channel, str, "channel", "an input's name")
         if isinstance(self.samples, bool) or not isinstance(self.samples, int):
-            raise InputError(f"`samples` must be a whole number; got {shown(self.samples)}.")
+            raise InputError(f"`samples` must be a whole number; got {show(self.samples)}.")
 
     def apply(self, run: Run) -> Run:
         if self.channel not in run.names[: run.inputs]:

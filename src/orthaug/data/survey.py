@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.checks import Vector, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
@@ -164,7 +164,7 @@ def survey(path: Path) -> Survey:
             raise refused
         raise InputError(
             f"{path}: no column holds numbers; expected one for each signal, under a header. "
-            f"The names that were found are {shown(', '.join(every))}; a line above the header "
+            f"The names that were found are {show(', '.join(every))}; a line above the header "
             "must begin with # or %."
         )
     clock = find_clock(columns)

@@ -19,11 +19,11 @@ from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
 from orthaug._base.memory import check_memory
 from orthaug._base.progress import LOG
-from orthaug.data.headers import dated, in_seconds
+from orthaug.data.headers import in_seconds, parse_dates
 from orthaug.data.layouts import (
     Layout,
     as_number,
-    guessed_at,
+    first_foreign_line,
     layout,
     numbers_only,
     read_sheet,
@@ -125,7 +125,7 @@ def column_names(path: Path) -> list[str]:
             read_sheet(path, lambda header: found.extend(header) or [])
         else:
             found = layout(path).names
-    return [name for name in numbered(found) if name]
+    return [name for name in number_names(found) if name]
 
 
 def reading_note(path: Path) -> str:
@@ -138,7 +138,7 @@ def guessed_encoding(path: Path) -> int | None:
 
     None of any other file.
     """
-    return guessed_at(path) if _READERS.get(path.suffix.lower()) is _read_text else None
+    return first_foreign_line(path) if _READERS.get(path.suffix.lower()) is _read_text else None
 
 
 def check_readable(path: Path) -> None:
@@ -197,7 +197,7 @@ def _read_text(
 
     dates = None
     if time and texts is not None and not np.isfinite(values[time]).any():
-        dates = dated(texts[apart].to_numpy(), f"{path}: column '{time}'")
+        dates = parse_dates(texts[apart].to_numpy(), f"{path}: column '{time}'")
     values |= {time: dates} if time and dates is not None else {}
 
     def cell(column: str, row: int) -> str:
@@ -327,7 +327,7 @@ def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table
     arrays = {name: table.column(name).to_numpy(zero_copy_only=False) for name in columns}
     dates = None
     if time and arrays[time].dtype.kind not in "fiub":
-        dates = dated(arrays.pop(time), f"{path}: column '{time}'")
+        dates = parse_dates(arrays.pop(time), f"{path}: column '{time}'")
         if dates is None:
             raise InputError(
                 f"{path}: column '{time}' holds text; expected instants, numbers or dates."
@@ -335,7 +335,7 @@ def _read_parquet(path: Path, columns: Sequence[str], time: str | None) -> Table
     values = {name: _as_floats(array, name, path) for name, array in arrays.items()}
     values |= {time: dates} if time and dates is not None else {}
     return replace(
-        _full(path, {name: values[name] for name in columns}),
+        _full_table(path, {name: values[name] for name in columns}),
         dated=time if time and dates is not None else "",
     )
 
@@ -384,16 +384,16 @@ def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
 
     dates = None
     if time and not np.isfinite(values[time]).any():
-        dates = dated(np.array(cells[time], dtype=object), f"{path}: column '{time}'")
+        dates = parse_dates(np.array(cells[time], dtype=object), f"{path}: column '{time}'")
     values |= {time: dates} if time and dates is not None else {}
     return Table(path, values, filled, top + 1, cell, time if time and dates is not None else "")
 
 
 def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Table:
-    return _full(path, read_variables(path, columns))
+    return _full_table(path, read_variables(path, columns))
 
 
-def _full(path: Path, columns: Mapping[str, Vector]) -> Table:
+def _full_table(path: Path, columns: Mapping[str, Vector]) -> Table:
     """Return a table of a file type that has no empty cells."""
     filled = {name: len(values) for name, values in columns.items()}
     return Table(path, columns, filled, cell=lambda column, row: str(columns[column][row]))
@@ -470,7 +470,7 @@ def places(
     Raises:
         InputError: a column that is not there, or a name that is there twice.
     """
-    apart = numbered(header)
+    apart = number_names(header)
     check_present(
         path,
         [name for name in columns if name not in apart],
@@ -481,7 +481,7 @@ def places(
     return [apart.index(name) for name in columns]
 
 
-def numbered(header: Sequence[str]) -> list[str]:
+def number_names(header: Sequence[str]) -> list[str]:
     """Return names with a number behind those that occur more than once.
 
     They are counted as in pandas: `u.1` is the second `u`.

@@ -107,7 +107,7 @@ class TermLibrary:
         library = cls(
             (*library.factors, *new), (*products, *((first + i,) for i in range(len(new))))
         )
-        return library._without(exclude)
+        return library._exclude(exclude)
 
     def __len__(self) -> int:
         return len(self.products)
@@ -133,7 +133,7 @@ class TermLibrary:
             row[: len(product)] = product
         return table
 
-    def picked(self, chosen: Iterable[int]) -> TermLibrary:
+    def pick(self, chosen: Iterable[int]) -> TermLibrary:
         """Return some of the terms, of the same factors."""
         return TermLibrary(self.factors, tuple(self.products[i] for i in chosen))
 
@@ -152,7 +152,7 @@ class TermLibrary:
             written.append(atom if power == 1 else f"{atom}**{power}")
         return "*".join(written)
 
-    def _without(self, exclude: Iterable[str]) -> TermLibrary:
+    def _exclude(self, exclude: Iterable[str]) -> TermLibrary:
         texts = self.texts
         by_factors: Mapping[tuple[str, ...], int] = {
             _factors_of(text): i for i, text in enumerate(texts)
@@ -166,7 +166,7 @@ class TermLibrary:
                     f"`exclude` names the term '{text}', which is not among the terms{hint}."
                 )
             gone.add(there)
-        return self.picked(i for i in range(len(self)) if i not in gone) if gone else self
+        return self.pick(i for i in range(len(self)) if i not in gone) if gone else self
 
 
 def products_of(factors: Any, numbers: Any, xp: Any) -> Any:

@@ -124,7 +124,7 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
                 held[info.filename.removesuffix(".npy")] = FileVariable(
                     f"unreadable: {short(error)}", None
                 )
-        return _taken(path, names, held)
+        return _take_channels(path, names, held)
 
 
 _LONGEST_HEAD = 2**16  # bytes of a member that are unpacked to know what it is
@@ -178,20 +178,20 @@ def _from_mat(path: Path, names: Wanted) -> dict[str, Vector]:
     roots = {_ROOT.split(name.lstrip("/"))[0] for name in asked}
     held: dict[str, FileVariable] = {}
     for name, variable in variables.items():
-        held |= _held(
+        held |= _variable_tree(
             path, variable, deep=not roots or name in roots or not roots <= variables.keys()
         )
-    return _taken(path, names, _with_names(held))
+    return _take_channels(path, names, _with_names(held))
 
 
-def _held(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
+def _variable_tree(path: Path, variable: Variable, *, deep: bool) -> dict[str, FileVariable]:
     """Return a variable and, if wanted, its contents, by their paths."""
     if not variable.what:
         return {variable.name: _lazy(path, variable.shape, 8, variable.numbers)}
     text = variable.text if variable.what == "text" else None
     held = {variable.name: FileVariable(variable.what, None, variable.shape, text)}
     for part in variable.parts() if deep else ():
-        held |= _held(path, part, deep=True)
+        held |= _variable_tree(path, part, deep=True)
     return held
 
 
@@ -207,7 +207,7 @@ def _from_hdf5(path: Path, names: Wanted) -> dict[str, Vector]:
         ]  # complains of broken tables on which a visit never ends
         found = _Datasets(path, file, path.suffix.lower() == ".mat", {})
         file.visititems(found.add)
-        return _taken(path, names, _with_names(found.held) if found.matlab else found.held)
+        return _take_channels(path, names, _with_names(found.held) if found.matlab else found.held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,14 +319,16 @@ def short(error: Exception) -> str:
 def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], Any]) -> FileVariable:
     what = "×".join(map(str, shape)) or "a scalar"
 
-    def fitting() -> Any:
+    def read_checked() -> Any:
         check_memory(2 * math.prod(shape) * max(itemsize, 8), f"{path}: an array of {what} numbers")
         return read()
 
-    return FileVariable(what, fitting, tuple(shape))
+    return FileVariable(what, read_checked, tuple(shape))
 
 
-def _taken(path: Path, names: Wanted, held: Mapping[str, FileVariable]) -> dict[str, Vector]:
+def _take_channels(
+    path: Path, names: Wanted, held: Mapping[str, FileVariable]
+) -> dict[str, Vector]:
     """Return the named channels.
 
     Without names an empty one for each that could be named; or the single numbers wanted.

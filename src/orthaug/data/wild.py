@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.lines import counted, percent
+from orthaug._base.lines import percent, plural
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -59,8 +59,8 @@ def wild_samples(record: Record) -> tuple[WildSample, ...]:
     distance = np.stack([_distance(column) for column in whole.T], axis=1)
     found = []
     for j, name in enumerate(names):
-        rows, apart = _far(distance[:, j])
-        if len(rows) and not _explained(distance, rows, j, inputs, starts):
+        rows, apart = _far_samples(distance[:, j])
+        if len(rows) and not _is_explained(distance, rows, j, inputs, starts):
             owner = np.searchsorted(starts, rows, side="right") - 1
             at = [(int(i), int(k - starts[i])) for i, k in zip(owner, rows, strict=True)]
             found += [
@@ -76,7 +76,7 @@ def _distance(column: Vector) -> Vector:
     return np.where(there, np.abs(column - middle), 0.0)
 
 
-def _far(distance: Vector) -> tuple[list[int], float]:
+def _far_samples(distance: Vector) -> tuple[list[int], float]:
     """Return the few samples that are many times farther than all others, and how many times."""
     if len(distance) < _FEWEST:
         return [], 0.0
@@ -91,7 +91,9 @@ def _far(distance: Vector) -> tuple[list[int], float]:
     return [], 0.0
 
 
-def _explained(distance: Matrix, rows: list[int], j: int, inputs: int, starts: np.ndarray) -> bool:
+def _is_explained(
+    distance: Matrix, rows: list[int], j: int, inputs: int, starts: np.ndarray
+) -> bool:
     """Return whether other channels explain these samples.
 
     Outputs do by a response, an input as the cause.
@@ -151,7 +153,7 @@ def data_warnings(
         found.append(
             Warning("wild_samples", _wild_text(record, own, effect(samples) if effect else ""))
         )
-    return [*found, *_twice(record), *_frozen(record)]
+    return [*found, *_repeat_warnings(record), *_frozen_warnings(record)]
 
 
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
@@ -193,7 +195,7 @@ def _share_of(record: Record, own: tuple[WildSample, ...]) -> float:
     )
 
 
-def _twice(record: Record) -> list[Warning]:
+def _repeat_warnings(record: Record) -> list[Warning]:
     for experiment in record.experiments:
         values = np.hstack([experiment.inputs, experiment.outputs])
         if len(values) < _FEWEST:
@@ -213,7 +215,7 @@ def _twice(record: Record) -> list[Warning]:
     return []
 
 
-def _frozen(record: Record) -> list[Warning]:
+def _frozen_warnings(record: Record) -> list[Warning]:
     """Return warnings of frozen outputs: constant for many rows while an input moves.
 
     Elsewhere hardly two neighbouring rows are equal.
@@ -223,7 +225,7 @@ def _frozen(record: Record) -> list[Warning]:
         for experiment in record.experiments:
             y, n = experiment.outputs[:, j], len(experiment)
             same = y[1:] == y[:-1]
-            begin, rows = _longest(same)
+            begin, rows = _longest_stretch(same)
             rest = np.concatenate([same[:begin], same[begin + rows :]])
             if rows < max(_FROZEN, _FROZEN_SHARE * n) or not len(rest) or rest.mean() > _STILL:
                 continue
@@ -233,7 +235,7 @@ def _frozen(record: Record) -> list[Warning]:
                 continue
             text = (
                 f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
-                f"{counted(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
+                f"{plural(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
                 "and changes from row to row elsewhere: a sensor or a recorder was frozen. "
                 "Leave these rows out (`rows` of the data)."
             )
@@ -242,7 +244,7 @@ def _frozen(record: Record) -> list[Warning]:
     return found
 
 
-def _longest(same: np.ndarray) -> tuple[int, int]:
+def _longest_stretch(same: np.ndarray) -> tuple[int, int]:
     """Return where the longest stretch of true values begins, and how many there are."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     if not len(edges):

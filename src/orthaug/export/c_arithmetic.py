@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrapped
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrap_items
 from orthaug.export.program import Block, Constant, Layer, Program
 
 _MATH = {
@@ -79,7 +79,7 @@ def arithmetic(program: Program) -> str:
     parts += [
         "\n".join(
             f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */"
-            for c in _used(program)
+            for c in _used_constants(program)
         )
     ]
     for name in sorted(program.activations - {"identity"}):
@@ -96,7 +96,7 @@ def _safe(text: str) -> str:
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
-def _used(program: Program) -> list[Constant]:
+def _used_constants(program: Program) -> list[Constant]:
     """Return constants that some block reads: compilers warn of an unused one."""
     read = set[str]().union(*(names_in(node) for block in program.blocks for node in block.nodes))
     return [constant for constant in program.constants if constant.name in read]
@@ -127,10 +127,10 @@ def _table(name: str, values: np.ndarray) -> str:
     if values.ndim == 1:
         return (
             f"static const real {name}[{len(values)}] = "
-            f"{{\n{wrapped(list(map(_number, values)), ' ' * 4)}\n}};"
+            f"{{\n{wrap_items(list(map(_number, values)), ' ' * 4)}\n}};"
         )
     rows = ",\n".join(
-        f"    {{{wrapped(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values
+        f"    {{{wrap_items(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values
     )
     return f"static const real {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}\n}};"
 

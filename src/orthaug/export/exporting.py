@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug import __version__
 from orthaug._base.checks import check_type, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug._base.jax import jax
 from orthaug.export.kinds import TARGETS, VECTORS, Target
@@ -56,7 +56,7 @@ def check_target(to: str) -> str:
     """
     if not isinstance(to, str) or to not in TARGETS:
         hint = nearest(to, TARGETS) if isinstance(to, str) else ""
-        raise InputError(f"no export to {shown(to)}{hint}; known are {', '.join(TARGETS)}.")
+        raise InputError(f"no export to {show(to)}{hint}; known are {', '.join(TARGETS)}.")
     return to
 
 
@@ -70,7 +70,7 @@ def check_export(to: str, folder: Path, name: str = "model", *, force: bool = Fa
     )
     if not plain or keyword.iskeyword(name) or name in _TAKEN:
         raise InputError(
-            f"{shown(name)} cannot name the exported code; use ASCII letters, digits and "
+            f"{show(name)} cannot name the exported code; use ASCII letters, digits and "
             f"underscores, at most {_LONGEST}, starting with a letter, and no word of a "
             "language or library."
         )
@@ -150,9 +150,9 @@ Model sha256: `{program.digest}` (`checksum` in `model.json`)
 {prepared}Sampling time: {program.sampling_time:.9g} s.
 A step takes the inputs of one sample and gives its outputs.
 
-{_listed("Inputs, in order:", program.inputs)}
-{_listed("Outputs:", program.outputs)}
-{_listed(state, program.states)}{hold}
+{_list_signals("Inputs, in order:", program.inputs)}
+{_list_signals("Outputs:", program.outputs)}
+{_list_signals(state, program.states)}{hold}
 ## Use
 
 {target.usage(program)}
@@ -175,7 +175,7 @@ def _of_prepared(program: Program) -> str:
     )
 
 
-def _listed(head: str, signals: Sequence[Signal]) -> str:
+def _list_signals(head: str, signals: Sequence[Signal]) -> str:
     lines = [f"- `{signal.name}`{f' [{signal.unit}]' if signal.unit else ''}" for signal in signals]
     return "\n".join([head, "", *(lines or ["- none"]), ""])
 

@@ -48,7 +48,7 @@ class Fmu:
             "fmi2.c": _WRAPPER.read_text(encoding="utf-8"),
             "variables.h": _variables(program),
         }
-        folder, ending, library = _compiled(sources)
+        folder, ending, library = _compile_library(sources)
         archive = BytesIO()
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
             parts: dict[str, str | bytes] = {"modelDescription.xml": _description(program)}
@@ -88,7 +88,7 @@ def _target() -> tuple[str, str]:
     return _PLATFORMS[sys.platform]
 
 
-def _compiled(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
+def _compile_library(sources: Mapping[str, str]) -> tuple[str, str, bytes]:
     """Return folder, ending and content of the shared library.
 
     Raises:

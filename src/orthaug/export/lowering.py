@@ -83,7 +83,7 @@ class FadeNodes:
         """Names of the intermediate results for a reader, numbered from 1 like the features."""
         return {key: _read(key) for key, _ in self.locals}
 
-    def faded(self, correction: Node) -> Node:
+    def fade(self, correction: Node) -> Node:
         """Return a correction multiplied by the factor of fading."""
         return correction if self.share is None else apply("mul", self.share, correction)
 
@@ -143,7 +143,7 @@ class _Constants:
         }
 
 
-def _lagged(model: Model, name: str, digest: str) -> Program:
+def _lower_lagged(model: Model, name: str, digest: str) -> Program:
     form, numbers, memory = model.form, model.numbers, model.memory
     if form.baseline.function is not None:
         raise InputError(f"the physics {_OWN_FUNCTION}.")
@@ -158,25 +158,25 @@ def _lagged(model: Model, name: str, digest: str) -> Program:
     lags |= {Lag(channel, 0): Entry("u", i) for i, channel in enumerate(memory.inputs)}
     constants = _Constants()
 
-    def written(expression: Expression, lags: Mapping[Lag, Node] = lags) -> Node:
+    def lower_expression(expression: Expression, lags: Mapping[Lag, Node] = lags) -> Node:
         return node_of(expression, constants.of(expression), lags, dict(expression.constants))
 
     limited = numbers.limits is not None
-    features = [written(entry) for entry in form.features.entries]
+    features = [lower_expression(entry) for entry in form.features.entries]
     held = (
         FadeNodes.of(form, numbers, features, [lags[lag] for lag in form.layout])
         if limited
         else None
     )
     constants.symbols |= {} if held is None else held.symbols
-    sums, corrections = _weighted_terms(model, constants, written, held)
+    sums, corrections = _weighted_terms(model, constants, lower_expression, held)
     network = None
     if form.bound is not None:
         seen = features if held is None else held.features
         network = _network(form.bound, numbers, seen, np.arange(len(form.outputs)))
         for i, summands in enumerate(sums):
             correction = total([Entry("g", i), *corrections[i]])
-            summands.append(correction if held is None else held.faded(correction))
+            summands.append(correction if held is None else held.fade(correction))
     block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
@@ -259,7 +259,7 @@ def _with_correction(
     if rows:
         physics, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
-    return apply("add", physics, correction if held is None else held.faded(correction))
+    return apply("add", physics, correction if held is None else held.fade(correction))
 
 
 def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
@@ -294,13 +294,15 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
 
     names = define(names)
 
-    def written(expression: Expression, names: Mapping[str, Node] = names) -> Node:
+    def lower_expression(expression: Expression, names: Mapping[str, Node] = names) -> Node:
         return node_of(expression, names, {}, numeric)
 
-    features = [written(entry) for entry in form.features]
+    features = [lower_expression(entry) for entry in form.features]
     learned_states, learned_outputs = motion.learned
     equations = {"rate": [*motion.equations.values()], "output": [*motion.observations]}
-    results = {kind: list(map(written, expressions)) for kind, expressions in equations.items()}
+    results = {
+        kind: list(map(lower_expression, expressions)) for kind, expressions in equations.items()
+    }
     held, changed = None, list[dict[str, Node]]()
     if numbers.limits is not None:
         points: list[Node] = [
@@ -331,13 +333,16 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
-                rows = [written(equations[kind][place], there) for there in changed]
+                rows = [lower_expression(equations[kind][place], there) for there in changed]
                 results[kind][place] = _with_correction(
                     Entry("g", i), results[kind][place], held, rows
                 )
         seen = list(network.features) if network is not None else []
         blocks[kind] = Block(
-            kind, _needed(defined, [*results[kind], *seen]), network, tuple(results[kind])
+            kind,
+            _needed_definitions(defined, [*results[kind], *seen]),
+            network,
+            tuple(results[kind]),
         )
     return _moving_program(model, blocks, constants, name, digest)
 
@@ -365,7 +370,10 @@ def _moving_program(
     )
 
 
-_LOWERED: dict[type, Callable[[Any, str, str], Program]] = {Model: _lagged, MotionModel: _motion}
+_LOWERED: dict[type, Callable[[Any, str, str], Program]] = {
+    Model: _lower_lagged,
+    MotionModel: _motion,
+}
 
 
 def _signal(channel: Channel) -> Signal:
@@ -377,7 +385,9 @@ def _step_input(name: str, units: Mapping[str, str]) -> Signal:
     return Signal(name, identifier(bare) + "_next" * (bare != name), units.get(bare, ""))
 
 
-def _needed(defined: Mapping[str, Node], roots: Sequence[Node]) -> tuple[tuple[str, Node], ...]:
+def _needed_definitions(
+    defined: Mapping[str, Node], roots: Sequence[Node]
+) -> tuple[tuple[str, Node], ...]:
     """Return the definitions that some nodes reach, in order."""
     reached: set[str] = set()
 

@@ -176,28 +176,30 @@ def identifier(name: str) -> str:
     )
 
 
-def _of(function: str, *arguments: Node) -> Node:
+def _apply(function: str, *arguments: Node) -> Node:
     return Apply(function, arguments)
 
 
 _A, _ONE, _NULL = Name("a"), Number(1.0), Number(0.0)
 
 
-_SIGMOID = _of("div", _ONE, _of("add", _ONE, _of("exp", _of("neg", _A))))
-_CUBIC = _of("add", _A, _of("mul", Number(0.044715), _of("whole_power", _A, Number(3.0))))
+_SIGMOID = _apply("div", _ONE, _apply("add", _ONE, _apply("exp", _apply("neg", _A))))
+_CUBIC = _apply("add", _A, _apply("mul", Number(0.044715), _apply("whole_power", _A, Number(3.0))))
 ACTIVATIONS: dict[str, Node] = {
-    "tanh": _of("tanh", _A),
-    "relu": _of("max", _A, _NULL),
-    "gelu": _of(
+    "tanh": _apply("tanh", _A),
+    "relu": _apply("max", _A, _NULL),
+    "gelu": _apply(
         "mul",
-        _of("mul", Number(0.5), _A),
-        _of("add", _ONE, _of("tanh", _of("mul", Number(math.sqrt(2 / math.pi)), _CUBIC))),
+        _apply("mul", Number(0.5), _A),
+        _apply("add", _ONE, _apply("tanh", _apply("mul", Number(math.sqrt(2 / math.pi)), _CUBIC))),
     ),
     "sigmoid": _SIGMOID,
-    "silu": _of("mul", _A, _SIGMOID),
-    "elu": _of("add", _of("max", _A, _NULL), _of("expm1", _of("min", _A, _NULL))),
-    "softplus": _of(
-        "add", _of("max", _A, _NULL), _of("log1p", _of("exp", _of("neg", _of("abs", _A))))
+    "silu": _apply("mul", _A, _SIGMOID),
+    "elu": _apply("add", _apply("max", _A, _NULL), _apply("expm1", _apply("min", _A, _NULL))),
+    "softplus": _apply(
+        "add",
+        _apply("max", _A, _NULL),
+        _apply("log1p", _apply("exp", _apply("neg", _apply("abs", _A)))),
     ),
     "identity": _A,
 }
@@ -265,7 +267,7 @@ def decimal(value: float) -> str:
     return repr(float(value))
 
 
-def wrapped(items: list[str], indent: str, width: int = 110) -> str:
+def wrap_items(items: list[str], indent: str, width: int = 110) -> str:
     """Return items with commas, in lines."""
     lines, line = [], ""
     for item in items:

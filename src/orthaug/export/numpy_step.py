@@ -66,7 +66,7 @@ class NumpyStep:
         self._following = np.array(program.following, dtype=int)
         self._advance = None
         if program.rate is not None and program.scheme is not None:
-            self._advance = _advancing(
+            self._advance = _advance_function(
                 self._block(program.rate), program.scheme, program.held, program.ends
             )
         self._held = program.held
@@ -152,8 +152,9 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     Args:
         model: as `estimate` or `load` gives it.
 
-    Returns: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs` list
-        what is in both.
+    Returns:
+        The step: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs`
+        list the entries of both.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a spline hold.
@@ -174,7 +175,7 @@ def numpy_step(model: Model | MotionModel) -> NumpyStep:
     return NumpyStep(program_of(model))
 
 
-def _advancing(
+def _advance_function(
     rate: Callable[[Vector, Vector], Vector], scheme: Scheme, held: int, ends: int
 ) -> Callable[[Vector, Vector], Vector]:
     """Return x one sample later, of x and the step's inputs."""

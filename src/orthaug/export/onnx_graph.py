@@ -80,7 +80,7 @@ class _Graph:
         now = self.part(u, range(program.held)) if program.ends == 2 else u
         y = self.add("Identity", self.block(program.output, "state", now), out="outputs")
         if program.states:
-            self.add("Identity", self.following(now, u, y), out="next_state")
+            self.add("Identity", self.following_state(now, u, y), out="next_state")
         real = self.onnx.TensorProto.DOUBLE
         sizes = {"state": program.states, "inputs": program.inputs}
         results = {"next_state": program.states, "outputs": program.outputs}
@@ -121,7 +121,7 @@ class _Graph:
     def part(self, vector: str, which: Sequence[int] | range) -> str:
         return self.add("Gather", vector, self.table(np.array(list(which), dtype=np.int64)))
 
-    def joined(self, parts: Sequence[str]) -> str:
+    def concat(self, parts: Sequence[str]) -> str:
         return parts[0] if len(parts) == 1 else self.add("Concat", *parts, axis=0)
 
     def block(self, block: Block, x: str, u: str) -> str:
@@ -130,7 +130,7 @@ class _Graph:
         for name, node in block.locals:
             known[name] = self.node(node, known)
         if block.network is not None:
-            z = self.joined([self.node(node, known) for node in block.network.features])
+            z = self.concat([self.node(node, known) for node in block.network.features])
             for layer in block.network.layers:
                 z = self.product(layer.weight, z)
                 z = z if layer.bias is None else self.add("Add", z, self.table(layer.bias))
@@ -140,7 +140,7 @@ class _Graph:
                     else self.node(ACTIVATIONS[layer.activation], {"a": z})
                 )
             known["g"] = z
-        return self.joined([self.node(node, known) for node in block.results])
+        return self.concat([self.node(node, known) for node in block.results])
 
     def product(self, weight: Matrix, z: str) -> str:
         """Return W z.
@@ -194,7 +194,7 @@ class _Graph:
         upright = self.add("Mul", self.add("Sign", y), self.real(np.pi / 2))
         return self.add("Where", self.add("Equal", x, zero), upright, beside)
 
-    def following(self, now: str, u: str, y: str) -> str:
+    def following_state(self, now: str, u: str, y: str) -> str:
         """Return the next state."""
         program, scheme = self.program, self.program.scheme
         if scheme is None or program.rate is None:
@@ -203,7 +203,7 @@ class _Graph:
                 for name, there in ((y, True), (u, program.inputs), ("state", program.states))
                 if there
             ]
-            return self.part(self.joined(parts), program.following)
+            return self.part(self.concat(parts), program.following)
         if scheme.kind == "discrete":
             return self.block(program.rate, "state", u)
         x, halves, slope = "state", 2 * scheme.substeps, ""
@@ -211,11 +211,11 @@ class _Graph:
             after = self.part(u, range(program.held, 2 * program.held))
             slope = self.add("Div", self.add("Sub", after, now), self.real(halves))
         for j in range(0, halves, 2):
-            at = [self.combined(now, (j + i, slope)) if slope else now for i in range(3)]
+            at = [self.combine(now, (j + i, slope)) if slope else now for i in range(3)]
             x = self.exact(x, *at) if scheme.kind == "exact" else self.runge_kutta(x, *at)
         return x
 
-    def combined(self, x: str, *terms: tuple[float, str]) -> str:
+    def combine(self, x: str, *terms: tuple[float, str]) -> str:
         """Return x plus multiples of vectors."""
         for factor, vector in terms:
             x = self.add("Add", x, self.add("Mul", self.real(factor), vector))
@@ -226,11 +226,11 @@ class _Graph:
         assert rate is not None and scheme is not None
         h = scheme.step
         k1 = self.block(rate, x, first)
-        k2 = self.block(rate, self.combined(x, (h / 2, k1)), middle)
-        k3 = self.block(rate, self.combined(x, (h / 2, k2)), middle)
-        k4 = self.block(rate, self.combined(x, (h, k3)), last)
-        return self.combined(
-            x, (h / 6, self.add("Add", self.combined(k1, (2.0, self.add("Add", k2, k3))), k4))
+        k2 = self.block(rate, self.combine(x, (h / 2, k1)), middle)
+        k3 = self.block(rate, self.combine(x, (h / 2, k2)), middle)
+        k4 = self.block(rate, self.combine(x, (h, k3)), last)
+        return self.combine(
+            x, (h / 6, self.add("Add", self.combine(k1, (2.0, self.add("Add", k2, k3))), k4))
         )
 
     def exact(self, x: str, first: str, middle: str, last: str) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS, Language, decimal, wrapped
+from orthaug.export.nodes import ACTIVATIONS, Language, decimal, wrap_items
 from orthaug.export.program import Block, Program, Vectors
 
 
@@ -74,11 +74,11 @@ def _arrays(block: Block, dialect: Dialect) -> list[str]:
 
 
 def _array(name: str, values: np.ndarray, dialect: Dialect) -> str:
-    def listed(numbers: np.ndarray, indent: str) -> str:
-        return f"[{wrapped([decimal(v) for v in numbers], indent).strip()}]"
+    def list_numbers(numbers: np.ndarray, indent: str) -> str:
+        return f"[{wrap_items([decimal(v) for v in numbers], indent).strip()}]"
 
-    rows = ",\n".join(f"    {listed(row, ' ' * 5)}" for row in np.atleast_2d(values))
-    inner = listed(values, " " * 4) if values.ndim == 1 else f"[\n{rows},\n]"
+    rows = ",\n".join(f"    {list_numbers(row, ' ' * 5)}" for row in np.atleast_2d(values))
+    inner = list_numbers(values, " " * 4) if values.ndim == 1 else f"[\n{rows},\n]"
     return f"{name} = {dialect.array.format(inner)}"
 
 
@@ -104,7 +104,7 @@ def _block(block: Block, dialect: Dialect) -> str:
 def _vector(entries: Sequence[str], dialect: Dialect) -> str:
     text = ", ".join(entries)
     return dialect.vector.format(
-        f"\n{wrapped([*entries], ' ' * 8)},\n    " if len(text) > 90 else text
+        f"\n{wrap_items([*entries], ' ' * 8)},\n    " if len(text) > 90 else text
     )
 
 

@@ -5,13 +5,8 @@ from .criteria import Simulation as Simulation
 from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
 from .motion_estimates import MotionEstimate as MotionEstimate
-from .narx import AugmentedNARX as AugmentedNARX
 from .recursive import Recursive as Recursive
-from .regressor import AugmentedRegressor as AugmentedRegressor
-from .solvers import AdamLBFGS as AdamLBFGS
 from .solvers import LevenbergMarquardt as LevenbergMarquardt
 from .status import Status as Status
 from .structures import Additive as Additive
-from .structures import BaselinePenalty as BaselinePenalty
 from .structures import Orthogonal as Orthogonal
-from .structures import OrthogonalPenalty as OrthogonalPenalty

@@ -122,7 +122,7 @@ class RunCheckpoint:
 
         None where there is none.
 
-        A checksum tells what was damaged, not what was made: a run does not go on from what it
+        A checksum shows what was damaged, not what was made: a run does not go on from what it
         cannot have written.
         """
         from safetensors import SafetensorError

@@ -27,12 +27,12 @@ from orthaug.fitting.unfinished import (
     NOT_CONVERGED,
     ending_in_words,
     follows_training,
+    is_unfinished,
     not_converged,
-    unfinished,
     withheld,
 )
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
-from orthaug.inference.nearly_shared import grown
+from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
@@ -58,7 +58,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
     """
     problem = task.problem
     warnings: list[Warning] = []
-    if unfinished(learned) and follows_training(structure, problem, learned):
+    if is_unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
         warnings += (
             [not_converged(learned)] if learned.tilt is None else []
@@ -105,7 +105,9 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         ),
         restarts=(),
         excitation=problem.excitation,
-        covariance=grown(errors.covariance, model.statistics, shared) if known else None,
+        covariance=enlarge_covariance(errors.covariance, model.statistics, shared)
+        if known
+        else None,
         freedom=errors.freedom,
         effective_weights=learned.effective,
         defect=_defect(task, structure, share, ThetaSplit(theta, theta_aux, fixed), learned),
@@ -155,8 +157,8 @@ def _model(
         weight=problem.weight.matrix,
         shared=directions(structure, problem, parameters.fixed),
         statistics=Statistics(
-            None if learned.gram is None else _beside(held, learned.gram),
-            None if middle is None else _beside(held, middle),
+            None if learned.gram is None else _fix_entries(held, learned.gram),
+            None if middle is None else _fix_entries(held, middle),
             noise,
             learned.ridge,
             errors.freedom,
@@ -214,19 +216,19 @@ def _beside_the_learner(
     middle = _middle(problem, learned, problem.weight.covariance(whitened))
     if gram is None or middle is None:
         return None
-    factor, taken = problem.projection, eliminate(structure, problem).taken_beside(fixed)
+    factor, taken = problem.projection, eliminate(structure, problem).taken_with_fixed(fixed)
     nt = len(taken)
     overlap = np.linalg.solve(factor.to_coordinates.T, gram[:nt, nt:])  # QᵀJ
     k = np.column_stack([np.eye(nt), factor.from_coordinates(taken @ overlap)])
     covariance = JointCovariance(
-        _beside(fixed, gram), learned.ridge, _beside(fixed, middle), nt
+        _fix_entries(fixed, gram), learned.ridge, _fix_entries(fixed, middle), nt
     ).of(k)
     held = list(fixed)
     covariance[held] = covariance[:, held] = np.nan
     return covariance
 
 
-def _beside(fixed: Fixed, gram: Matrix) -> Matrix:
+def _fix_entries(fixed: Fixed, gram: Matrix) -> Matrix:
     """Return a Gram matrix of (c, w) in which entries at a bound are no unknowns."""
     unknown = np.ones(len(gram))
     unknown[list(fixed)] = 0.0

@@ -22,8 +22,9 @@ def settle(fixed: Fixed, run: Callable[[Fixed], Fixed | None]) -> Fixed:
 
     What was held together once before is not released again, so that this ends.
 
-    Args: fixed: what is held first. run: runs with some entries held, and gives those that are at
-        one then; None to leave it at that.
+    Args:
+        fixed: the entries fixed first.
+        run: runs with some entries fixed, and returns those that are at a bound then; None to end.
     """
     tried = [fixed]
     while (active := run(fixed)) is not None:
@@ -75,11 +76,11 @@ class Elimination:
         """True where θ is independent of the learner, and the learner of bounds (F1)."""
         return not self._learner({}).any()
 
-    def taken_beside(self, fixed: Fixed) -> Matrix:
+    def taken_with_fixed(self, fixed: Fixed) -> Matrix:
         """Return P (nθ, nθ) where some entries of θ are at a bound."""
         if not fixed or self.shared is None:
             return self.taken
-        basis = np.linalg.qr(self.to_coordinates @ self.shared.leaving(fixed).basis)[0]
+        basis = np.linalg.qr(self.to_coordinates @ self.shared.without_entries(fixed).basis)[0]
         return basis @ basis.T
 
     @property
@@ -88,7 +89,7 @@ class Elimination:
 
     def _learner(self, fixed: Fixed) -> Matrix:
         return np.concatenate(
-            [np.eye(len(self.outputs)) - self.taken_beside(fixed), self.rows.learner]
+            [np.eye(len(self.outputs)) - self.taken_with_fixed(fixed), self.rows.learner]
         )
 
     @property
@@ -154,7 +155,7 @@ class Elimination:
             },
         )
 
-    def settled(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
+    def settle(self, run: Callable[[Fixed], Vector | None]) -> Fixed:
         """Return the entries at a bound where training with the same entries fixed ended.
 
         Those of physics alone at first.
@@ -196,7 +197,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     """
     baseline, projection = problem.baseline, problem.projection
     nt = len(baseline.names)
-    shared = _shared(structure, problem)
+    shared = _shared_directions(structure, problem)
     partly = structure.projects and np.isfinite(baseline.bounds).any() and not shared.all
     return Elimination(
         to_coordinates=projection.to_coordinates,
@@ -211,7 +212,7 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     )
 
 
-def _shared(structure: Structure, problem: Problem) -> Shared:
+def _shared_directions(structure: Structure, problem: Problem) -> Shared:
     names = problem.baseline.names
     return Shared(names, np.eye(len(names))) if structure.shared == "all" else problem.shared
 
@@ -224,8 +225,8 @@ def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()
     Args:
         fixed: entries of θ at a bound, which no direction moves.
     """
-    shared = _shared(structure, problem)
-    return None if shared.all else shared.leaving(fixed).basis
+    shared = _shared_directions(structure, problem)
+    return None if shared.all else shared.without_entries(fixed).basis
 
 
 class ThetaSplit(NamedTuple):
@@ -265,7 +266,7 @@ def split_theta(
             i: value for i, value in enumerate(inside) if value != reached[i]
         }
     fixed = elimination.active(share) if fixed is None else fixed
-    taken = elimination.taken_beside(fixed) @ share
+    taken = elimination.taken_with_fixed(fixed) @ share
     aux = factor.from_coordinates(taken)
     if elimination.shared is not None:
         aux[list(fixed)] = 0.0  # but for rounding it is

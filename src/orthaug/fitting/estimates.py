@@ -28,9 +28,14 @@ from orthaug.inference.covariance import (
 from orthaug.inference.influence import hc3, one_step_slopes
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure, Points, Support, Training
-from orthaug.inference.nearly_shared import grown
+from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
-from orthaug.inference.splitting import MeasureSplit, learner_slope, split_under, streamed_slope
+from orthaug.inference.splitting import (
+    MeasureSplit,
+    learner_slope,
+    split_by_measure,
+    streamed_slope,
+)
 from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
@@ -222,11 +227,11 @@ class Estimate(AnyFit):
             self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
         )
         joint = self.model.statistics.joint(len(self.theta))
-        under = split_under(measure, self.model, support, joint)
+        under = split_by_measure(measure, self.model, support, joint)
         if under.covariance is not None:
             training = self.covariance if self.measure is None else None
             training = (
-                split_under(Training(), self.model, support, joint).covariance
+                split_by_measure(Training(), self.model, support, joint).covariance
                 if training is None
                 else training
             )
@@ -258,7 +263,7 @@ class Estimate(AnyFit):
         )
 
     def withheld(self, kind: str, why: Warning) -> Estimate:
-        """The same without standard errors and intervals, of θ, of terms and of predictions.
+        """Return the fit without standard errors and intervals of θ, terms and predictions.
 
         A warning says why.
         """
@@ -330,7 +335,7 @@ class Estimate(AnyFit):
             slope = self._slope()
             covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
         plain = self.covariance if self.plain_covariance is None else self.plain_covariance
-        covariance = self._grown(covariance, self.model.statistics)
+        covariance = self._enlarge(covariance, self.model.statistics)
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
 
     def _hc3(self) -> Estimate:
@@ -358,7 +363,7 @@ class Estimate(AnyFit):
         return replace(
             self,
             model=replace(self.model, statistics=own),
-            covariance=self._grown(self._cov_along(own, self._slope()), own),
+            covariance=self._enlarge(self._cov_along(own, self._slope()), own),
             plain_covariance=self.covariance
             if self.plain_covariance is None
             else self.plain_covariance,
@@ -366,9 +371,9 @@ class Estimate(AnyFit):
             std_kind="hc3",
         )
 
-    def _grown(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
+    def _enlarge(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
         """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
-        return grown(
+        return enlarge_covariance(
             covariance, statistics, None if self.model.shared is None else self.problem.shared
         )
 

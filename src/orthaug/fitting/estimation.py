@@ -10,7 +10,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
@@ -27,11 +27,11 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.rules import check_cost, check_solver, checked_starts, tried
+from orthaug.fitting.rules import check_cost, check_solver, checked_starts, choose_regularizations
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, planned, train
-from orthaug.inference.covariance import whitening
+from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
+from orthaug.inference.covariance import whitening_matrix
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Learner, Scaling
 from orthaug.models.model import Model
@@ -48,21 +48,22 @@ _TURNS = 30
 _SETTLED = 1e-6  # relative change of W
 
 
-def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
+def reweight(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
     """Return the fit whose outputs are weighted by the covariance of its own errors.
 
     Args:
         first: a fit with any output weights.
         again: the fit of a problem with other weights, begun from an earlier estimate.
 
-    Returns: The last fit, with the restarts of the first one. It stays at the weights it has where
-        the errors' covariance is singular; a warning says that the turns did not settle.
+    Returns:
+        The last fit, with the restarts of the first one. It keeps its weights where the errors'
+        covariance is singular; a warning says that the turns did not settle.
     """
     estimate, problem = first, first.problem
     covariance = problem.target_covariance
     for _ in range(_TURNS):
         noise = estimate.model.statistics.noise if estimate.status.ok else None
-        white = None if noise is None else whitening(noise)
+        white = None if noise is None else whitening_matrix(noise)
         if white is None:
             return replace(estimate, restarts=first.restarts)
         weight = by_covariance(white, covariance)
@@ -71,7 +72,7 @@ def reweighted(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) 
         )
         if change <= _SETTLED:
             return replace(estimate, restarts=first.restarts)
-        problem = problem.weighed(weight)
+        problem = problem.weigh(weight)
         estimate = again(problem, estimate)
     text = (
         f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits; θ "
@@ -234,7 +235,7 @@ def estimate(
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     _check_types(criterion=criterion)
-    problem, engine = posed_on(
+    problem, engine = pose_source(
         record, engine, baseline, lags, inputs, output_weights=output_weights
     )
     options |= {
@@ -311,7 +312,7 @@ def fit(
         "validated": validation is not None,
         "learner": learner,
     }
-    choices = tried(regularization, solver, criterion, structure, **given)
+    choices = choose_regularizations(regularization, solver, criterion, structure, **given)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
     check_solver(solver, criterion, () if learner is None else choices)
@@ -324,7 +325,7 @@ def fit(
         _check_cost(problem, learner, solver, restarts * len(choices), engine)
         problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
-        starts = planned(task.bound, range(seed, seed + restarts), choices)
+        starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
     ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
     if task.bound is None and solved:
@@ -350,10 +351,10 @@ def fit(
         "solver": solver,
         "engine": engine,
     }
-    return reweighted(estimate, partial(_again, **more, progress=progress))
+    return reweight(estimate, partial(_refit_weights, **more, progress=progress))
 
 
-def _again(problem: Problem, last: Estimate, **options: Any) -> Estimate:
+def _refit_weights(problem: Problem, last: Estimate, **options: Any) -> Estimate:
     """Return the fit to other weights of the outputs, from the end of the last fit."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
     start = None if last.model.form.bound is None else last.model
@@ -475,7 +476,7 @@ def _warm_start(
             f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
         )
     scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    problem = problem.seen_linearly() if model.form.features.linear else problem
+    problem = problem.for_linear_learner() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
     return task, np.asarray(numbers.weights), model.theta - model.theta_aux
 
@@ -515,16 +516,16 @@ def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> 
         elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
             raise InputError(
                 "`regularization` must be auto, none, evidence, ard or a number; got "
-                f"{shown(choice)}."
+                f"{show(choice)}."
             )
         elif not (is_number(choice) and choice >= 0):
-            raise InputError(f"`regularization` must be 0 or more; got {shown(choice)}.")
+            raise InputError(f"`regularization` must be 0 or more; got {show(choice)}.")
     if not choices:
         raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
     return auto
 
 
-def posed_on(
+def pose_source(
     record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
 ) -> tuple[Problem, Engine]:
     """Return the problem with the engine that sums over its rows; further arguments as of `pose`.

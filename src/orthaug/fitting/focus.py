@@ -21,7 +21,14 @@ from orthaug._base.progress import LOG
 from orthaug.data.record import Record
 from orthaug.fitting.colour import autocorrelation
 from orthaug.fitting.criteria import Prediction
-from orthaug.fitting.held_out import Candidate, Focus, Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import (
+    Candidate,
+    Focus,
+    Pieces,
+    held_out_blocks,
+    mean_square,
+    squared_errors,
+)
 from orthaug.fitting.training import FOLD_ITERATIONS
 from orthaug.fitting.unfinished import NOT_CONVERGED
 
@@ -64,7 +71,7 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
     LOG.info("auto: %s; the free run is trained, too", reason)
     free_run = _free_run(criterion, problem)
     try:
-        return _best(_FocusChoice(problem, first, fit, options, free_run), reason)
+        return _best_estimate(_FocusChoice(problem, first, fit, options, free_run), reason)
     except InputError as error:  # too few rows for a free run
         text = f"trained one step ahead; {reason}, but the free run cannot be trained: {error}"
         return replace(first, focus=Focus(ONE_STEP, text))
@@ -122,7 +129,7 @@ def _errors(fit: Any, record: Record, problem: Any) -> Pieces:
 def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, Any]:
     """Return a fit to the first half, and the other half; nothing for too few rows."""
     try:
-        training, held = blocked(problem.record, HALVES, problem.first_row)[-1]
+        training, held = held_out_blocks(problem.record, HALVES, problem.first_row)[-1]
         return fit(problem.on(training), criterion=Prediction(), **_quick(options)), held
     except InputError:
         return None, None
@@ -210,7 +217,7 @@ class _FocusChoice:
         """Return the estimate of a candidate from all rows."""
         focus, learner = key
         if focus == ONE_STEP:
-            return _without(self.first, learner)
+            return _drop_learner(self.first, learner)
         return self.free if learner else self.free_physics
 
     @cached_property
@@ -226,10 +233,10 @@ class _FocusChoice:
         pieces: dict[Key, list[Any]] = {key: [] for key in keys}
         for training, held in records:
             whole = training is self.problem.record
-            made = {} if whole else {ONE_STEP: self._made(training, Prediction()),
-                                     FREE_RUN: self._made(training, self.free_run)}  # fmt: skip
+            criteria = {} if whole else {ONE_STEP: Prediction(), FREE_RUN: self.free_run}
+            made = {key: self._quick_fit(training, one) for key, one in criteria.items()}
             for key, found in pieces.items():
-                one = self.estimate(key) if whole else _without(made[key[0]], key[1])
+                one = self.estimate(key) if whole else _drop_learner(made[key[0]], key[1])
                 found += _errors(one, held, self.problem)
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
@@ -239,27 +246,27 @@ class _FocusChoice:
         Of few rows the training data themselves.
         """
         try:
-            return blocked(
+            return held_out_blocks(
                 self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row
             )
         except InputError:
             return [(self.problem.record, self.problem.record)]
 
-    def _made(self, training: Record, criterion: Any) -> Any:
+    def _quick_fit(self, training: Record, criterion: Any) -> Any:
         try:
             return self.fit(self.problem.on(training), criterion=criterion, **_quick(self.options))
         except InputError:  # the block took away what the physics needs
             return None
 
 
-def _without(estimate: Any, learner: bool) -> Any:
+def _drop_learner(estimate: Any, learner: bool) -> Any:
     """Return an estimate, or that of its physics alone."""
     if learner or estimate is None or estimate.physics_alone is None:
         return estimate
     return estimate.physics_alone
 
 
-def _best(choosing: _FocusChoice, reason: str) -> Any:
+def _best_estimate(choosing: _FocusChoice, reason: str) -> Any:
     """Return the estimate of the candidate with the least error.
 
     Only candidates whose free run over all rows is sound count.

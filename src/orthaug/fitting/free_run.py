@@ -57,7 +57,7 @@ def train_physics_only(
     lengthen. Of all ends the best over whole experiments is kept; where a start was better than
     them, whole experiments are trained on too.
     """
-    plan = plan.alone
+    plan = plan.physics_only
     objective = plan.objective(structure)
     least_squares, initial = objective.begin(np.zeros(0)), plan.problem.baseline.initial
     starts = [
@@ -73,7 +73,7 @@ def train_physics_only(
         ends += _lengthen(plan, solver, structure, starts)
     if plan.whole is not plan.segments and plan.lengthens:
         ends += _over_whole(plan, solver, structure, starts, ends)
-    best = _best(ends)
+    best = _lowest_end(ends)
     spent = {"iterations": sum(e.iterations for e in ends), "seconds": sum(e.seconds for e in ends)}
     return None if best is None else best._replace(**spent)
 
@@ -146,7 +146,7 @@ def _over_whole(
     return [own._replace(iterations=end.iterations, seconds=end.seconds)]
 
 
-def _best(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
+def _lowest_end(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
     """Return the lowest end over whole experiments, or over segments where all diverge."""
     usable = [end for end in ends if end.ending.usable]
     flying = [end for end in usable if np.isfinite(end.mean_square)]
@@ -171,7 +171,7 @@ class FreeRunTask(SimulationTask):
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
         plan = SegmentedStreamed if isinstance(task.problem, StreamedProblem) else SegmentedLagged
-        return cls(plan.of(task, criterion), None, warm).keeping(task.checkpoints)
+        return cls(plan.of(task, criterion), None, warm).with_checkpoints(task.checkpoints)
 
     @property
     def rows_task(self) -> OneStepTask:
@@ -184,7 +184,7 @@ class FreeRunTask(SimulationTask):
         """
         if self.physics is None:
             return self.rows_task.physics_alone()
-        plan = self.plan.alone
+        plan = self.plan.physics_only
         return plan.task, replace(self, plan=plan).learned(self.physics)
 
     def on(self, record: Record) -> FreeRunTask:

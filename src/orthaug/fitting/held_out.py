@@ -198,7 +198,7 @@ def squared_errors(
     return pieces
 
 
-def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
+def held_out_blocks(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
     """Return (training, held out) for each of `blocks` contiguous blocks of similar length.
 
     `start` rows around a block are left out.
@@ -234,14 +234,16 @@ def blocked(record: Record, blocks: int, start: int) -> list[tuple[Record, Recor
     least = min(sum(len(e) - start for e in kept) for kept, _ in folds)
     return [
         (
-            replace(record, experiments=_cut(kept, least, start)),
+            replace(record, experiments=_trim_experiments(kept, least, start)),
             replace(record, experiments=tuple(held)),
         )
         for kept, held in folds
     ]
 
 
-def _cut(experiments: list[Experiment], usable: int, start: int) -> tuple[Experiment, ...]:
+def _trim_experiments(
+    experiments: list[Experiment], usable: int, start: int
+) -> tuple[Experiment, ...]:
     """Return the experiments less the last rows of the longest, so that `usable` remain."""
     cut = list(experiments)
     while (surplus := sum(len(e) - start for e in cut) - usable) > 0:

@@ -32,7 +32,7 @@ def independent_terms(
         return replace(problem, features=Features(())), None, ()
     if not isinstance(learner, Terms):
         return problem, learner, ()
-    problem = problem.seen_linearly()
+    problem = problem.for_linear_learner()
     texts, rows, nt = (
         [str(entry) for entry in problem.features.entries],
         problem.rows,

@@ -107,7 +107,7 @@ class Task(Protocol):
         """Return the task without a learner, and the residual of physics alone."""
         ...
 
-    def prepared(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
+    def prepare(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
         """Return the task with physics alone trained: all runs start from it."""
         ...
 

@@ -23,7 +23,7 @@ from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines
 from orthaug.inference.measures import Measure, Training
 from orthaug.inference.motion_split import MotionSplit, split_motion
-from orthaug.inference.nearly_shared import grown
+from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
@@ -283,7 +283,7 @@ def _with_split(
         model=model,
         covariance=None
         if fit.std_kind == "none"
-        else grown(covariance, fit.model.statistics, split.shared),
+        else enlarge_covariance(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
         at_bound=at_bound,

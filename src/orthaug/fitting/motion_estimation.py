@@ -19,14 +19,19 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.rules import check_motion_choices, check_solver, checked_starts, tried
+from orthaug.fitting.rules import (
+    check_motion_choices,
+    check_solver,
+    checked_starts,
+    choose_regularizations,
+)
 from orthaug.fitting.segmented_motion import SegmentedMotion
-from orthaug.fitting.silence import learner_silent, silenced
+from orthaug.fitting.silence import is_silenced, learner_silent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, planned, train
-from orthaug.fitting.unfinished import ending_in_words, not_converged, unfinished, withheld
+from orthaug.fitting.training import Choice, plan_runs, train
+from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_converged, withheld
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling
@@ -83,13 +88,15 @@ def fit_motion(
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
     validated = validation is not None
     conditions = {"linear": False, "validated": validated, "motion": True}
-    choices = tried(regularization, solver, criterion, structure, learner=learner, **conditions)
+    choices = choose_regularizations(
+        regularization, solver, criterion, structure, learner=learner, **conditions
+    )
     restarts, seed = checked_starts(restarts, seed, warm=False, ensemble=False)
     check_solver(solver, criterion, () if learner is None else choices)
     engine = runs_on(engine) if restarts * len(choices) > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
-    task = MotionTask.of(problem, learner, criterion, engine).keeping(kept)
-    starts = planned(task.bound, range(seed, seed + restarts), choices)
+    task = MotionTask.of(problem, learner, criterion, engine).with_checkpoints(kept)
+    starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     retry = isinstance(regularization, str) and regularization == "auto"
     chosen = Choice(validation, blocks, fallback, retry=retry)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
@@ -115,7 +122,7 @@ def conclude_motion(
     assert learned.coefficients is not None and learned.errors is not None
     states = plan.segments.start if learned.scores is None else learned.scores.states
     slope = None if learned.scores is None else learned.scores.slope
-    unsettled = (not_converged(learned),) if unfinished(learned) else ()
+    unsettled = (not_converged(learned),) if is_unfinished(learned) else ()
     learned = withheld(learned) if unsettled else learned
     errors = learned.errors
     assert errors is not None and learned.coefficients is not None
@@ -142,7 +149,7 @@ def conclude_motion(
         defect=None,
         problem=task.problem,
         criterion=task.criterion,
-        split_by=MotionSplit.none("training", plan.dynamics, learned.coefficients),
+        split_by=MotionSplit.empty("training", plan.dynamics, learned.coefficients),
         segmented=plan,
         states=states,
         slope=slope,
@@ -163,7 +170,7 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
     None of others.
     """
     bound = plan.bound
-    if bound is None or learned.scores is None or not silenced(learned.effective, bound.ny):
+    if bound is None or learned.scores is None or not is_silenced(learned.effective, bound.ny):
         return None
     assert learned.coefficients is not None
     x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
@@ -265,7 +272,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
     return best
 
 
-def reopened(model: MotionModel, record: Record) -> MotionEstimate:
+def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
     """Return the estimate of a saved model with its training data, to split again.
 
     It lacks the results of its training.
@@ -282,7 +289,7 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
     problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
-    segmented = SegmentedMotion.of(problem, form.bound, criterion).refined(form.substeps)
+    segmented = SegmentedMotion.of(problem, form.bound, criterion).with_substeps(form.substeps)
     centre, half = (
         (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
     )
@@ -310,7 +317,7 @@ def reopened(model: MotionModel, record: Record) -> MotionEstimate:
         defect=None,
         problem=problem,
         criterion=criterion,
-        split_by=MotionSplit.none(model.measure, form, c),
+        split_by=MotionSplit.empty(model.measure, form, c),
         segmented=segmented,
         states=kept.states,
         slope=kept.slope,

@@ -118,10 +118,10 @@ def _sum_over(
     q: Float[Array, "np"],
     size: Float[Array, "nl"],
 ) -> Float[Array, "np n0+n m"]:
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     c, w = numbers.theta - numbers.theta_aux, numbers.weights
 
-    def mixed(x: Any, row: Any) -> Any:
+    def mixed_derivative(x: Any, row: Any) -> Any:
         def half(q: Any, x: Any) -> Any:
             return jnp.sum(rest_of(form, numbers, q, c, w, x, form.now(row), size) ** 2) / 2
 
@@ -130,7 +130,7 @@ def _sum_over(
     def step(carry: Any, row: Any) -> Any:
         state, slopes, total = carry
         inputs, there = row
-        turned = jax.vmap(mixed, -1, -1)(state, inputs)
+        turned = jax.vmap(mixed_derivative, -1, -1)(state, inputs)
         turned = jnp.where(jnp.isfinite(turned) & there, turned, 0.0)
         total = total + jnp.einsum("qim,inm->qnm", turned, slopes)
         state, slopes, _, _ = form.tangents(numbers, state, slopes, inputs)

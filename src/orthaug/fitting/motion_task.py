@@ -55,7 +55,7 @@ def train_motion_physics(
 
     None where no run is finite.
     """
-    own, initial = segmented.alone, segmented.problem.motion.coordinates.initial
+    own, initial = segmented.physics_only, segmented.problem.motion.coordinates.initial
     steps = own.segments.steps
     lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
     ends: list[FreeRunFit] = []
@@ -83,10 +83,10 @@ def train_motion_physics(
     segmented, best = _fine_enough(segmented, best, solver)
     point = best.end.point
     states = np.asarray(point.states)
-    x, _ = segmented.alone.trajectory(point.theta, (), states)
+    x, _ = segmented.physics_only.trajectory(point.theta, (), states)
     size = np.abs(x).max(axis=0, initial=0.0)
     segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
-    mean_square = segmented.alone.mean_square(point.theta, ())
+    mean_square = segmented.physics_only.mean_square(point.theta, ())
     return segmented, best._replace(mean_square=mean_square, iterations=iterations, seconds=seconds)
 
 
@@ -104,11 +104,11 @@ def _descend(
     None where no run is finite.
     """
     if rows is not None:
-        segmented = segmented.starting_from(rows)
+        segmented = segmented.with_starts(rows)
     objective = segmented.objective()
     places = []
     for q in starts:
-        states = segmented.settled(q, iterations=_SETTLING)
+        states = segmented.settle(q, iterations=_SETTLING)
         places.append((objective.evaluate(q, Start(states)).loss, q, states))
     loss, q, states = min(places, key=lambda place: place[0])
     if not np.isfinite(loss):
@@ -119,10 +119,10 @@ def _descend(
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
     """Return whether the runs follow most of the outputs' variation."""
-    return bool(_left(segmented, free_fit) < _POOR**2 * segmented.residuals)
+    return bool(_squared_errors(segmented, free_fit) < _POOR**2 * segmented.residuals)
 
 
-def _left(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
+def _squared_errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
     """Return the sum of squared errors, each output in its deviation.
 
     Infinite where they are too large to square.
@@ -144,17 +144,19 @@ def _fine_enough(
         and motion.integrator != "discrete"
         and segmented.dynamics.substeps < MOST_SUBSTEPS
     ):
-        finer = segmented.refined(2 * segmented.dynamics.substeps)
-        if moved_by(segmented.alone, finer.alone, free_fit) <= _FINE:
+        finer = segmented.with_substeps(2 * segmented.dynamics.substeps)
+        if substep_shift(segmented.physics_only, finer.physics_only, free_fit) <= _FINE:
             break
-        again = _descend_on(finer.alone, solver, free_fit)
+        again = _descend_on(finer.physics_only, solver, free_fit)
         if again is None:
             break
         segmented, free_fit = finer, again
     return segmented, free_fit
 
 
-def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit) -> float:
+def substep_shift(
+    segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeRunFit
+) -> float:
     """Return by what share of the residual finer integrator steps move the outputs."""
     point = free_fit.end.point
     runs = []
@@ -167,7 +169,7 @@ def moved_by(segmented: SegmentedMotion, finer: SegmentedMotion, free_fit: FreeR
     scored = np.asarray(segmented.segments.scored)[:, :, None]
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / segmented.deviation[:, None]
-        ratio = np.sqrt(np.sum(moved**2) / max(_left(segmented, free_fit), 1e-300))
+        ratio = np.sqrt(np.sum(moved**2) / max(_squared_errors(segmented, free_fit), 1e-300))
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 
@@ -227,7 +229,7 @@ class MotionTask(SimulationTask):
 
         Without an end where no run of it is finite.
         """
-        alone = replace(self, plan=self.plan.alone)
+        alone = replace(self, plan=self.plan.physics_only)
         if self.physics is not None:
             return alone, alone.learned(self.physics)
         unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
@@ -254,7 +256,7 @@ class MotionTask(SimulationTask):
         end, objective = run.end, run.objective
         if end.linear is None:
             return super().learned(run)
-        information = objective.eliminated(end.point, _LOOSER * objective.start_rows)[0]
+        information = objective.eliminate(end.point, _LOOSER * objective.start_rows)[0]
         return super().learned(
             run._replace(end=end._replace(linear=end.linear._replace(information=information)))
         )
@@ -272,7 +274,7 @@ class MotionTask(SimulationTask):
         if plan.bound is None:
             return plan
         point = physics.end.point
-        x, u = (part.T for part in plan.alone.trajectory(point.c, (), point.states))
+        x, u = (part.T for part in plan.physics_only.trajectory(point.c, (), point.states))
         with np.errstate(all="ignore"):
             features = np.asarray(plan.dynamics.seen(x, u, np)).T
         finite = features[np.isfinite(features).all(axis=1)]

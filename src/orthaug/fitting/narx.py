@@ -15,7 +15,7 @@ from orthaug.fitting.scikit_learn import (
     Augmented,
     Physics,
     baseline_of,
-    checked,
+    check_arrays,
     checked_again,
     input_names,
     learner_of,
@@ -132,7 +132,7 @@ class AugmentedNARX(Augmented):
         """
         check_choice(self.score_on, SCORED_ON, "`score_on`")
         given = y
-        X, y = checked(self, X, y)
+        X, y = check_arrays(self, X, y)
         names = input_names(self)
         self.output_names_ = output_names(given, y.shape[1], names)
         baseline = baseline_of(self.physics, self._layout(names), self.output_names_)
@@ -150,7 +150,7 @@ class AugmentedNARX(Augmented):
         Raises:
             InputError (a ValueError): other columns than in the fit, too short an experiment.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         y = self._outputs(y, len(X))
         found = np.full(y.shape, np.nan)
@@ -174,7 +174,7 @@ class AugmentedNARX(Augmented):
             InputError (a ValueError): other columns than in the fit, too short an experiment or
                 `initial`.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         found = np.full((len(X), len(self.output_names_)), np.nan)
         whole = initial is not None and np.ndim(initial) > 0 and len(initial) == len(X)

@@ -118,7 +118,7 @@ class FreeRunObjective:
         if self.sums is not None:
             step = unknowns - start.unknowns if follows and start.unknowns is not None else None
             made = (self.weight, self.start_rows)
-            total, squares = self.sums.tried(
+            total, squares = self.sums.try_step(
                 self.dynamics, self.numbers(c, w), self.segments, start, step, *made
             )
             return total, start.values, None, squares
@@ -131,17 +131,17 @@ class FreeRunObjective:
 
     def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
         """Return normal equations about a trial, with its states at their best."""
-        information, gradient, following = self.eliminated(point, self.start_rows)
+        information, gradient, following = self.eliminate(point, self.start_rows)
         start = Start(point.states, point.misfit, np.concatenate([point.c, point.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
-    def kept(self, point: TrialPoint) -> tuple[Any, ...]:
-        """Return the values from which `again` makes the trial, bit by bit."""
+    def values_of(self, point: TrialPoint) -> tuple[Any, ...]:
+        """Return the values from which `trial_of` makes the trial, bit by bit."""
         squares = np.zeros((0, 0)) if point.squares is None else point.squares
         return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
-    def again(self, kept: tuple[Any, ...]) -> TrialPoint:
-        """Return the trial of values that were `kept`."""
+    def trial_of(self, kept: tuple[Any, ...]) -> TrialPoint:
+        """Return the trial of values that `values_of` returned."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)
         known = self.sums is not None
@@ -150,7 +150,7 @@ class FreeRunObjective:
             p, theta, c, w, states, errors, float(misfit), float(loss), squares if known else None
         )
 
-    def eliminated(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
+    def eliminate(self, point: TrialPoint, rows: Matrix) -> tuple[Matrix, Vector, dict[str, Any]]:
         """Return the normal equations of (c, w), L = `rows`, and how the states follow.
 
         The latter in the form of `Start`.

@@ -94,7 +94,7 @@ class OneStepTask(TrainingRows):
 
     @property
     def start_loss(self) -> float:
-        """Loss of physics alone, in the units of `loss`: of least squares before `prepared`."""
+        """Loss of physics alone, in the units of `loss`: of least squares before `prepare`."""
         if self.physics_loss is not None:
             return self.physics_loss
         return self.problem.unexplained_moments.square / self.problem.samples
@@ -114,7 +114,7 @@ class OneStepTask(TrainingRows):
         return self
 
     @property
-    def alone(self) -> OneStepTask:
+    def physics_only(self) -> OneStepTask:
         """The task without a learner."""
         problem, scaling = (
             replace(self.problem, features=Features(())),
@@ -126,7 +126,7 @@ class OneStepTask(TrainingRows):
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """Return the task without a learner, and least squares on its rows."""
-        return self.alone, self.alone.physics_learned()
+        return self.physics_only, self.physics_only.physics_learned()
 
     def on(self, record: Record) -> OneStepTask:
         """Return the task on another record."""
@@ -134,7 +134,7 @@ class OneStepTask(TrainingRows):
             self.problem.on(record), self.bound and self.bound.learner, engine=self.engine
         )
 
-    def prepared(
+    def prepare(
         self, solver: Any, structure: Structure, progress: RunProgress = quiet
     ) -> OneStepTask:
         """Return the task with the loss of physics alone under the structure's rows and bounds.
@@ -147,10 +147,10 @@ class OneStepTask(TrainingRows):
         missed = problem.target_coordinates - problem.projection.to_coordinates @ theta
         loss = float(problem.unexplained_moments.square + missed @ missed) / problem.samples
         begins = self.bound is not None and solver.gauss_newton and not structure.from_initial
-        few = self._few() if begins and problem.count >= MANY_ROWS else None
-        return replace(self, physics_loss=loss, few=few and few.prepared(solver, structure))
+        few = self._train_on_subsample() if begins and problem.count >= MANY_ROWS else None
+        return replace(self, physics_loss=loss, few=few and few.prepare(solver, structure))
 
-    def _few(self) -> OneStepTask | None:
+    def _train_on_subsample(self) -> OneStepTask | None:
         """Return the end of training on a subsample of the rows, weights in the same units.
 
         None where it lacks what the physics needs.
@@ -194,7 +194,9 @@ class OneStepTask(TrainingRows):
         elimination = eliminate(structure, self.problem)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
         plain = not (structure.from_initial or len(elimination.rows.target))
-        if not (plain and solver.gauss_newton and solver.iterations and self._above(run)):
+        if not (
+            plain and solver.gauss_newton and solver.iterations and self._is_above_physics(run)
+        ):
             return run
         silent = (
             self.bound.silent(np.asarray(w)) if self.bound else None
@@ -202,14 +204,14 @@ class OneStepTask(TrainingRows):
         w = w if silent is None else jnp.asarray(silent)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
         if (
-            elimination.bounded and silent is not None and self._above(run)
+            elimination.bounded and silent is not None and self._is_above_physics(run)
         ):  # the bounds of another active set
             return self._run_inside(
                 solver.at_most(0), w, structure, elimination, regularization, progress
             )
         return run
 
-    def _above(self, run: compiled.TrainingRun) -> bool:
+    def _is_above_physics(self, run: compiled.TrainingRun) -> bool:
         """Return whether a run ended above physics alone."""
         return run.ending.usable and self.loss(run) > self.start_loss
 
@@ -243,7 +245,7 @@ class OneStepTask(TrainingRows):
             reach = elimination.bounded and not elimination.decoupled
             return self.coordinates(runs[-1]) if reach and runs[-1].ending.usable else None
 
-        fixed = elimination.settled(share)
+        fixed = elimination.settle(share)
         held = bool(elimination.hold(fixed)[0].any())
         known = None if elimination.decoupled else fixed
         return runs[-1]._replace(seconds=sum(run.seconds for run in runs), held=held, fixed=known)

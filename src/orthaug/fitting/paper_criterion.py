@@ -58,7 +58,7 @@ class Physics(NamedTuple):
         nt = len(initial)
         scale = free * np.sqrt(problem.count) / np.linalg.norm(to_rows, axis=0) if nt else free
 
-        def padded(matrix: np.ndarray) -> np.ndarray:
+        def pad_matrix(matrix: np.ndarray) -> np.ndarray:
             return np.concatenate([matrix, np.zeros((nt - len(matrix), *matrix.shape[1:]))])
 
         penalty = elimination.rows
@@ -67,9 +67,10 @@ class Physics(NamedTuple):
             elimination.outputs / rms if solved else to_rows @ initial,
             to_rows * (0.0 if solved else scale),
             elimination.outputs / rms,
-            padded(penalty.theta * scale) / rms,
-            padded(penalty.learner) if held is None else held[0],
-            (padded(penalty.target - penalty.theta @ initial) if held is None else held[1]) / rms,
+            pad_matrix(penalty.theta * scale) / rms,
+            pad_matrix(penalty.learner) if held is None else held[0],
+            (pad_matrix(penalty.target - penalty.theta @ initial) if held is None else held[1])
+            / rms,
             problem.samples,
             ridge,
         )

@@ -160,7 +160,7 @@ def upright(r: Float[np.ndarray, "*k n n"]) -> Float[np.ndarray, "*k n n"]:
     return r * sign[..., None]
 
 
-def started(
+def start_recursion(
     phi: Float[np.ndarray, "N ny nt"],
     target: Matrix,
     theta: Vector,
@@ -292,7 +292,7 @@ def covariances(
     result = np.full(r.shape, np.nan)
     if inflation is None or not determined.any():
         return result
-    half = _half(r[determined], squared[determined])
+    half = _half_factor(r[determined], squared[determined])
     result[determined] = level[determined, None, None] * (
         half @ inflation @ np.swapaxes(half, 1, 2)
     )
@@ -309,11 +309,11 @@ def inflation_of(
     """
     if covariance is None or not np.isfinite(covariance).all() or not level > 0:
         return None
-    half = _half(r[None], squared[None])[0]
+    half = _half_factor(r[None], squared[None])[0]
     return np.linalg.solve(half, np.linalg.solve(half, covariance).T) / level
 
 
-def _half(
+def _half_factor(
     r: Float[np.ndarray, "k nt nt"], squared: Float[np.ndarray, "k nt nt"]
 ) -> Float[np.ndarray, "k nt nt"]:
     """Return `S = R⁻¹ (R⁻ᵀ M R⁻¹)^½` of factors made unique by a positive diagonal."""

@@ -24,7 +24,7 @@ from orthaug._base.checks import (
     check_type,
     is_number,
 )
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
@@ -36,7 +36,7 @@ from orthaug.fitting.recursive_rows import (
     WhitenedRows,
     begin,
     joined_rows,
-    trained,
+    training_rows,
     whitened_rows,
 )
 from orthaug.fitting.residual_band import ResidualMonitor
@@ -109,8 +109,8 @@ class Recursive:
     ) -> None:
         check_choice(start, ("fit", "empty"), "`start`")
         if check_number(quiet, "quiet", positive=True) < 1:
-            raise InputError(f"`quiet` must be 1 row or more; got {shown(quiet)}.")
-        began = trained(fit, training)
+            raise InputError(f"`quiet` must be 1 row or more; got {show(quiet)}.")
+        began = training_rows(fit, training)
         factor = forgetting_factor(forgetting, memory, began.model.sampling_time)
         recursion, reference, inflation = begin(began, factor, quiet, empty=start == "empty")
         self._set(began.model, recursion, ResidualMonitor(reference), inflation, began.used)
@@ -158,13 +158,13 @@ class Recursive:
         Raises:
             InputError: the folder cannot be written, or holds something else.
         """
-        recursive_storage.save(self._kept(), folder, force=force)
+        recursive_storage.save(self._stored_state(), folder, force=force)
 
     def fill(self, folder: Path) -> None:
         """Write the files of `save` into an existing folder."""
-        recursive_storage.write(self._kept(), folder)
+        recursive_storage.write(self._stored_state(), folder)
 
-    def _kept(self) -> recursive_storage.RecursiveState:
+    def _stored_state(self) -> recursive_storage.RecursiveState:
         alarms = np.array([alarm.row for alarm in self.alarms], dtype=float)
         state = (
             self._fitted,
@@ -205,7 +205,7 @@ class Recursive:
             x, complete, tail = self._lagging.regressors(
                 self._lagging.nothing if begins[-1] else tail, rows
             )
-            prepared.append(self._whitened(x, complete, rows))
+            prepared.append(self._whiten(x, complete, rows))
         alarms = []
         for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
             if begun:
@@ -226,7 +226,7 @@ class Recursive:
         record = model.fitting(record, need_outputs=True)
         return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
 
-    def _whitened(
+    def _whiten(
         self, x: Matrix, complete: Any, rows: Matrix
     ) -> tuple[Any, WhitenedRows | None, int]:
         """Return the usable rows and their least-squares problem in θ."""
@@ -463,13 +463,13 @@ def forgetting_factor(forgetting: Any, memory: Any, sampling_time: float) -> flo
         if seconds < sampling_time:
             raise InputError(
                 f"`memory` must be at least one sampling time, {sampling_time:g} s; got "
-                f"{shown(memory)}."
+                f"{show(memory)}."
             )
         return math.exp(-sampling_time / seconds)
     if forgetting is None:
         return 1.0
     if not is_number(forgetting) or not _LEAST_FACTOR <= forgetting <= 1:
         raise InputError(
-            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {shown(forgetting)}."
+            f"`forgetting` must lie between {_LEAST_FACTOR:g} and 1; got {show(forgetting)}."
         )
     return float(forgetting)

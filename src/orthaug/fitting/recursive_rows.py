@@ -17,9 +17,9 @@ from orthaug.data.regressors import stack_rows
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.recursion import Recursion, inflation_of, squares, started
+from orthaug.fitting.recursion import Recursion, inflation_of, squares, start_recursion
 from orthaug.fitting.residual_band import Reference
-from orthaug.inference.covariance import newey_west, whitening
+from orthaug.inference.covariance import newey_west, whitening_matrix
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import Lagged
 from orthaug.models.model import Model
@@ -206,7 +206,7 @@ class TrainingRowsModel(NamedTuple):
     """Whether the covariance counts the colour of the errors."""
 
 
-def trained(fit: Any, training: Record | None) -> TrainingRowsModel:
+def training_rows(fit: Any, training: Record | None) -> TrainingRowsModel:
     """Return the rows of a fit.
 
     Raises:
@@ -314,10 +314,10 @@ def begin(
     noise = residual.T @ residual * (ny / freedom)
     least = (_SMALLEST * model.deviation * np.diag(model.weight)) ** 2
     noise = noise + np.diag(least)
-    white = whitening(noise)
+    white = whitening_matrix(noise)
     white = np.diag(1 / np.sqrt(np.diag(noise))) if white is None else white
     level = float(np.trace(noise)) / ny
-    recursion = started(
+    recursion = start_recursion(
         phi, target, model.theta, noise / level, level, freedom, forgetting, empty=empty
     )
     ends = np.cumsum(began.lengths)[:-1]

@@ -12,8 +12,8 @@ from orthaug.fitting.scikit_learn import (
     Augmented,
     Physics,
     baseline_of,
+    check_arrays,
     check_there,
-    checked,
     checked_again,
     input_names,
     learner_of,
@@ -98,7 +98,7 @@ class AugmentedRegressor(Augmented):
                 gives no finite model.
         """
         given = y
-        X, y = checked(self, X, y)
+        X, y = check_arrays(self, X, y)
         names = input_names(self)
         outputs = output_names(given, y.shape[1], names)
         record = Record.from_arrays(X, y, inputs=names, outputs=outputs)
@@ -119,7 +119,7 @@ class AugmentedRegressor(Augmented):
             InputError (a ValueError): other columns than in the fit, values that are not finite, an
                 expression without a value on a row; standard errors of a fit that has none.
         """
-        model = self._fitted().model
+        model = self._fitted_estimate().model
         X = checked_again(self, X)
         nothing = np.zeros((len(X), len(self.output_names_)))
         record = Record.from_arrays(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from orthaug._base.checks import check_count
-from orthaug._base.errors import InputError, KeyedError, shown
+from orthaug._base.errors import InputError, KeyedError, show
 from orthaug._base.memory import check_limit, check_memory, in_words
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS, Solver
@@ -36,10 +36,10 @@ def checked_starts(restarts: int, seed: int, *, warm: bool, ensemble: bool) -> t
 def check_starts(restarts: int, seed: int, *, ensemble: bool) -> None:
     """Raise InputError for seeds that are too large, or an ensemble of one."""
     if seed + restarts >= 2**63:
-        words = f": found {shown(seed)}; expected seeds below 2**63 for all restarts"
-        raise KeyedError(f"`seed` must be below 2**63; got {shown(seed)}.", "seed", words)
+        words = f": found {show(seed)}; expected seeds below 2**63 for all restarts"
+        raise KeyedError(f"`seed` must be below 2**63; got {show(seed)}.", "seed", words)
     if ensemble and restarts < 2:
-        words = f": found {shown(restarts)}; expected 2 or more for an ensemble"
+        words = f": found {show(restarts)}; expected 2 or more for an ensemble"
         raise KeyedError(
             "an ensemble needs `restarts` of 2 or more to be the median of.", "restarts", words
         )
@@ -94,7 +94,7 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
             )
 
 
-def tried(
+def choose_regularizations(
     given: Any,
     solver: Solver,
     criterion: Criterion,
@@ -199,9 +199,14 @@ def check_cost(
 ) -> None:
     """Raise InputError for normal equations beyond memory, or more than a month of training.
 
-    Args: learner: None for physics alone, which costs nothing; one that does not know its `weights`
-        is let pass. rows: usable ones. features, outputs: of the learner. iterations: of a run at
-        most. runs: restarts times regularizations. held: rows that are in memory; None for all.
+    Args:
+        learner: None for physics alone, which costs nothing; one without `weights` is accepted.
+        rows: usable rows.
+        features: of the learner.
+        outputs: of the learner.
+        iterations: of a run at most.
+        runs: restarts times regularizations.
+        held: rows that are in memory; None for all.
         room: of the workers or devices that add up; None where that is this process.
     """
     held = rows if held is None else held

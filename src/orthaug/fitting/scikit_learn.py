@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from orthaug._base.checks import check_count, nearest
-from orthaug._base.errors import InputError, TrainingError, shown
+from orthaug._base.errors import InputError, TrainingError, show
 from orthaug._base.jax import jax
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
 from orthaug.data.record import Record
@@ -113,7 +113,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def coef_table_(self) -> pd.DataFrame:
         """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        return self._fitted().parameters
+        return self._fitted_estimate().parameters
 
     @property
     def noise_std_(self) -> np.ndarray | None:
@@ -121,7 +121,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         None where no degrees of freedom are left.
         """
-        noise = self._fitted().model.statistics.noise
+        noise = self._fitted_estimate().model.statistics.noise
         return None if noise is None else np.sqrt(np.diag(noise))
 
     def set_params(self, **params: Any) -> Any:
@@ -146,7 +146,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 
-    def _fitted(self) -> Estimate:
+    def _fitted_estimate(self) -> Estimate:
         """Return the estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
 
@@ -154,7 +154,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return self.estimate_
 
 
-def checked(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+def check_arrays(estimator: Augmented, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return X (n, n_features) and y (n, n_outputs) for a fit, by scikit-learn's checks.
 
     Raises:
@@ -196,7 +196,7 @@ def input_names(estimator: Any) -> tuple[str, ...]:
     """
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
-    return tuple(name or _free(f"x{j}", good) for j, name in enumerate(good))
+    return tuple(name or _free_name(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
@@ -215,10 +215,10 @@ def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]
         is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named
     ):
         return tuple(named)
-    return tuple(_free("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
+    return tuple(_free_name("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
 
 
-def _free(name: str, taken: Sequence[str]) -> str:
+def _free_name(name: str, taken: Sequence[str]) -> str:
     while name in taken:
         name += "_"
     return name
@@ -254,8 +254,10 @@ def baseline_of(
 ) -> Baseline:
     """Return the physics of an estimator's argument.
 
-    Args: physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
-        Baseline, or a JAX function. layout: the regressor, for "linear" and for a function.
+    Args:
+        physics: "linear", expressions, `Term`s, a mapping of parameters to expressions, a
+            Baseline, or a JAX function.
+        layout: the regressor, for "linear" and for a function.
         outputs: with several, every expression has a parameter of its own for each, `gain_y0`.
         names: columns that expressions may use without an instant.
 
@@ -276,7 +278,7 @@ def baseline_of(
         line = {
             (f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout
         }
-        physics = {_free("intercept", [*line]): "1"} | line
+        physics = {_free_name("intercept", [*line]): "1"} | line
     elif (
         not isinstance(physics, str)
         and isinstance(physics, Sequence)
@@ -298,7 +300,7 @@ def baseline_of(
         raise InputError(
             "`physics` must be 'linear', a list of expressions or Terms, a mapping of "
             "parameters to expressions, a Baseline, or a function of a row; got "
-            f"{shown(physics)}."
+            f"{show(physics)}."
         )
     for term in physics:
         _check_columns(term.regressor, names)

@@ -46,7 +46,7 @@ class Squares(NamedTuple):
 def _errors(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any
 ) -> Float[Array, "T ny m"]:
-    run = chunk_response(dynamics, dynamics.prepared(numbers), states, segments.inputs)
+    run = chunk_response(dynamics, dynamics.prepare(numbers), states, segments.inputs)
     return jnp.where(segments.scored[:, None], segments.target - run, 0.0)
 
 
@@ -80,7 +80,7 @@ class SegmentEquations:
         self, chunk: Any, numbers: Numbers, weight: Any, rows: Any
     ) -> tuple[Any, tuple[Any, Any]]:
         segments, states = chunk
-        numbers = self.dynamics.prepared(numbers)
+        numbers = self.dynamics.prepare(numbers)
         there = (states, segments.inputs, segments.target, segments.scored)
         shared, own = chunk_sensitivity(self.dynamics, numbers, there, weight)
         if not self.free:
@@ -146,7 +146,7 @@ class SegmentSums:
         rows = self.rows(segments)
         return self.engine.beside(rows, self.engine.place(np.asarray(states), rows))
 
-    def tried(
+    def try_step(
         self,
         dynamics: Dynamics,
         numbers: Numbers,
@@ -177,7 +177,7 @@ class SegmentSums:
         """Return Σ e eᵀ (ny, ny) from the measured states."""
         ny, n0 = len(dynamics.outputs), dynamics.states
         start = Start(np.asarray(segments.start))
-        return self.tried(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
+        return self.try_step(dynamics, numbers, segments, start, None, np.eye(ny), np.eye(n0))[1]
 
     def moved(self, start: Start, step: Vector) -> Float[np.ndarray, "k n0 m"]:
         """Return the states after a step of (c, w)."""

@@ -27,13 +27,13 @@ from orthaug.physics.problem import Problem
 _SMALL = 4096
 
 
-def lagged(task: OneStepTask) -> Lagged:
+def lagged_dynamics(task: OneStepTask) -> Lagged:
     """Return the dynamics of a problem and its learner."""
     problem = task.problem
     return Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
 
 
-def declared(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
+def declared_settings(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
     """Return the settings of a segmented problem that come from task and criterion.
 
     They are the same wherever the segments are.
@@ -72,10 +72,16 @@ class SegmentedLagged(SegmentedProblem):
         Raises:
             InputError: nothing would be scored.
         """
-        dynamics, record, sums = lagged(task), task.problem.record, SegmentSums.of(task.engine)
+        dynamics, record, sums = (
+            lagged_dynamics(task),
+            task.problem.record,
+            SegmentSums.of(task.engine),
+        )
         small = like is not None and like.segments.scored.size <= _SMALL
         layout = Layout.of(record, dynamics, criterion, like if small else None, task.engine.shares)
-        return cls(**layout._asdict(), **declared(task, criterion), dynamics=dynamics, sums=sums)
+        return cls(
+            **layout._asdict(), **declared_settings(task, criterion), dynamics=dynamics, sums=sums
+        )
 
     @property
     def problem(self) -> Problem:
@@ -86,9 +92,9 @@ class SegmentedLagged(SegmentedProblem):
         return self.task.bound
 
     @cached_property
-    def alone(self) -> SegmentedLagged:
+    def physics_only(self) -> SegmentedLagged:
         """The problem without a learner."""
-        alone, task = self.dynamics.alone, self.task.alone
+        alone, task = self.dynamics.physics_only, self.task.physics_only
         return replace(
             self, task=task, dynamics=alone, scaling=task.scaling, unit=task.unit, fixed={}
         )
@@ -165,7 +171,7 @@ class StructuredObjective(FreeRunObjective):
         """Return p of the one-step θ for the weights w."""
         f = self.task.share_of(w)
         theta = self.elimination.theta(f, self.fixed or self.elimination.active(f))
-        return np.concatenate([theta if self.follows else theta - self._taken(f), w])
+        return np.concatenate([theta if self.follows else theta - self._theta_taken(f), w])
 
     def place(self, p: Vector) -> tuple[Vector, Vector, Vector]:
         """Return (unknown θ, c, w) of p.
@@ -173,7 +179,7 @@ class StructuredObjective(FreeRunObjective):
         Without bounds on an orthogonal θ the unknown is c itself.
         """
         theta, w = p[: self.physics], p[self.physics :]
-        c = theta - self._taken(self.task.share_of(w)) if self.follows else theta
+        c = theta - self._theta_taken(self.task.share_of(w)) if self.follows else theta
         return theta, c, w
 
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
@@ -215,17 +221,17 @@ class StructuredObjective(FreeRunObjective):
 
     def change(self, w: Vector) -> Matrix:
         """Return ∂(c, w)/∂(θ, w) for `c = θ − θ_aux(w)`."""
-        slope = self._taken(self.task.share_slope(w))
+        slope = self._theta_taken(self.task.share_slope(w))
         nt, nw = slope.shape
         return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
 
-    def _taken(self, share: Any) -> Any:
+    def _theta_taken(self, share: Any) -> Any:
         """Return θ_aux of the learner's share QᵀF, or of its derivative."""
         return self.task.problem.projection.from_coordinates(self._projector @ share)
 
     @cached_property
     def _projector(self) -> Matrix:
-        return self.elimination.taken_beside(self.fixed)
+        return self.elimination.taken_with_fixed(self.fixed)
 
     def held(self, end: Descent) -> Fixed:
         """Return the entries at a bound at the end of a run.

@@ -93,10 +93,10 @@ class SegmentedMotion(SegmentedProblem):
         return self.dynamics.bound
 
     @property
-    def alone(self) -> SegmentedMotion:
+    def physics_only(self) -> SegmentedMotion:
         """The problem without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
-        return replace(self, dynamics=self.dynamics.alone, scaling=nothing, unit=np.ones(0))
+        return replace(self, dynamics=self.dynamics.physics_only, scaling=nothing, unit=np.ones(0))
 
     def over(self, segment: int) -> SegmentedMotion:
         """Return the problem in segments of another length, without washout.
@@ -108,7 +108,7 @@ class SegmentedMotion(SegmentedProblem):
             self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
         )
 
-    def refined(self, substeps: int) -> SegmentedMotion:
+    def with_substeps(self, substeps: int) -> SegmentedMotion:
         """Return the problem with other substeps of the integrator."""
         dynamics = replace(self.dynamics, substeps=substeps)
         finer = replace(self, dynamics=dynamics)
@@ -122,7 +122,8 @@ class SegmentedMotion(SegmentedProblem):
         """Return the problem with signals (N, ns) of every experiment as further inputs."""
         if not signals:
             return self
-        names = tuple(f"signal {i}" for i in range(signals[0].shape[1]))
+        longest = max(len(channel.name) for channel in (*self.record.inputs, *self.record.outputs))
+        names = tuple(f"s{'_' * longest}{i}" for i in range(signals[0].shape[1]))  # no channel's
         pairs = zip(self.record.experiments, signals, strict=True)
         record = replace(
             self.record,
@@ -173,7 +174,7 @@ class SegmentedMotion(SegmentedProblem):
         """The matrix (ny, ny) that gives errors in the unit of the residual of physics alone."""
         return self.problem.weight.matrix / self.rms
 
-    def settled(
+    def settle(
         self, c: Vector, w: Any = (), segments: Segments | None = None, iterations: int = 12
     ) -> np.ndarray:
         """Return the initial states (k, n0, m) by which segments follow the outputs best."""
@@ -198,7 +199,7 @@ class SegmentedMotion(SegmentedProblem):
         inputs, target, scored = (np.asarray(part)[:, :longest] for part in self.whole[1:])
         first = Segments(self.whole.start, inputs, target, scored)
         with np.errstate(all="ignore"):
-            start = self.settled(c, w, first, 30)
+            start = self.settle(c, w, first, 30)
             errors = errors_of(self.dynamics, self.numbers(c, w), start, self.whole)
             scaled = errors / self.deviation[:, None]
             mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
@@ -230,7 +231,7 @@ class SegmentedMotion(SegmentedProblem):
             found.append(own)
         return found
 
-    def starting_from(self, rows: list[Matrix]) -> SegmentedMotion:
+    def with_starts(self, rows: list[Matrix]) -> SegmentedMotion:
         """Return the problem with segments that start at given states (N, nx) of all rows."""
         steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         starts = []
@@ -245,7 +246,7 @@ class SegmentedMotion(SegmentedProblem):
 
 def sizes(problem: MotionProblem) -> Vector:
     """Return the size of each state (nx,), from its guesses; 1 where none is known."""
-    size = np.abs(problem.looked_at[0]).max(axis=1)
+    size = np.abs(problem.guessed_points[0]).max(axis=1)
     return np.where(size > 0, size, 1.0)
 
 
@@ -254,7 +255,7 @@ def _states(
     form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Any:
     """Return the states (k, T, n0, m) of every segment's run."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 
     def one_chunk(chunk: Any) -> Any:

@@ -21,7 +21,7 @@ from orthaug.fitting.solvers.descent import MARQUARDT, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.status import Ending
-from orthaug.inference.covariance import noise_covariance, whitening
+from orthaug.inference.covariance import noise_covariance, whitening_matrix
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.learners import Scaling
 
@@ -173,7 +173,7 @@ class SegmentedProblem:
         kept = self._checkpoint(objective, p, start, options)
         end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
-        white = None if noise is None else whitening(noise)
+        white = None if noise is None else whitening_matrix(noise)
         if noise is not None and white is not None:
             size = (
                 np.trace(objective.weight @ noise @ objective.weight.T) / ny
@@ -220,7 +220,7 @@ class SegmentedProblem:
             "flight", p, np.asarray(start.values), *size, *chosen, form=OF_DESCENT
         )
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
+    def end_in_memory(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Return the end of a run with segments in memory; it has a derivative."""
         assert end.linear is not None
         return TrialInMemory(objective, end.point, objective.slope(end.linear.start))

@@ -26,7 +26,7 @@ from orthaug.fitting.objective import RUNAWAY, FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segmented_lagged import SegmentedLagged, declared, lagged
+from orthaug.fitting.segmented_lagged import SegmentedLagged, declared_settings, lagged_dynamics
 from orthaug.fitting.segmented_problem import COLOUR_ROWS, COLOURED_STEPS, TrialInMemory
 from orthaug.fitting.segments import CHUNK, Segments, begins_of, build_segments, segment_of
 from orthaug.fitting.solvers.descent import Descent
@@ -63,7 +63,7 @@ class SegmentedStreamed(SegmentedLagged):
                 "`segment` is 0, whole experiments, which need their rows in memory; give a "
                 "number of steps, such as 512, or a Record."
             )
-        dynamics = lagged(task)
+        dynamics = lagged_dynamics(task)
         empty, source, washout = problem.basis.form.empty, problem.source, free_run.washout
         found = ExperimentStarts.of(task.engine.passes(look, source.partitions))
         longest = max(found.rows) - dynamics.first_row
@@ -83,7 +83,9 @@ class SegmentedStreamed(SegmentedLagged):
                 colour = SourceSegments.cut(*made, 0, washout, COLOUR_ROWS)
         layout: dict[str, Any] = {"segments": segments, "whole": whole, "colour": colour}
         cut = {"source": source, "found": found, "empty": empty}
-        return cls(**layout, **cut, **declared(task, criterion), dynamics=dynamics, sums=sums)
+        return cls(
+            **layout, **cut, **declared_settings(task, criterion), dynamics=dynamics, sums=sums
+        )
 
     @property
     def lengthens(self) -> bool:
@@ -103,7 +105,7 @@ class SegmentedStreamed(SegmentedLagged):
             )
         return mean if mean < RUNAWAY else np.nan
 
-    def looked_at(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
+    def end_in_memory(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Return the segments of the subsample.
 
         Where that is all rows, with the states that were trained.
@@ -167,7 +169,7 @@ class PartitionRuns:
                 for part in (inputs, target)
             )
             given = (self.dynamics, self.numbers, run.state, *padded, scored, np.int64(rows))
-            state, squares = map(np.asarray, _along(*given))
+            state, squares = map(np.asarray, _advance_rows(*given))
             run = RunState(
                 state,
                 run.squares + squares,
@@ -178,7 +180,7 @@ class PartitionRuns:
 
 
 @partial(jax.jit, static_argnames="dynamics")
-def _along(
+def _advance_rows(
     dynamics: Dynamics,
     numbers: Numbers,
     state: Any,
@@ -188,7 +190,7 @@ def _along(
     rows: Any,
 ) -> tuple[Any, Any]:
     """Return the state after some rows, and the squares (ny,) of the scored errors."""
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
 
     def step(carry: Any, row: Any) -> tuple[Any, None]:
         state, squares = carry

@@ -112,7 +112,7 @@ def respond(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Float[Array, "k T ny m"]:
     """Return outputs of every segment from its state."""
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     return jax.lax.map(
         lambda chunk: chunk_response(dynamics, numbers, *chunk), (states, segments.inputs)
     )
@@ -155,7 +155,7 @@ def sensitivity(
 
     Rows are multiplied by `weight`.
     """
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     n = dynamics.unknowns
 
     def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
@@ -235,7 +235,7 @@ def _steps_at_once(
         state, states = jax.lax.scan(
             lambda state, row: (side_by_side(state, row), state), state, inputs
         )
-        steps = dynamics.local(numbers, _flat(states), _flat(inputs))
+        steps = dynamics.local(numbers, _flatten(states), _flatten(inputs))
         value, to_state, to_unknowns = (
             part.reshape(*part.shape[:-1], size, width) for part in steps
         )
@@ -261,7 +261,7 @@ def _steps_at_once(
     return jax.lax.scan(block, carry, cut)[0][2:]
 
 
-def _flat(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
+def _flatten(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
     steps, n, m = part.shape
     return jnp.moveaxis(part, 0, 1).reshape(n, steps * m)  # n = 0 of a motion without inputs
 
@@ -283,7 +283,7 @@ def block_scores(
     Args:
         place: the block of each step, the same in every segment.
     """
-    numbers = dynamics.prepared(numbers)
+    numbers = dynamics.prepare(numbers)
     _, n0, width = segments.start.shape
     n = dynamics.unknowns
 

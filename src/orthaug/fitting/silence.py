@@ -26,7 +26,7 @@ _CONSTANT = 1.5  # effective weights for each output of the learner: one is a co
 _FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a constant
 
 
-def silenced(effective: float, outputs: int) -> bool:
+def is_silenced(effective: float, outputs: int) -> bool:
     """Return whether a regularization left at most a constant of each output of the learner."""
     return effective < _CONSTANT * outputs
 
@@ -48,7 +48,7 @@ def add_retries(
     """
     by_evidence = all(start.regularization == "evidence" for start in starts)
     ended = all(run.ending.usable and run.ending is not Ending.STOPPED for run in runs)
-    if not (by_evidence and ended and all(silenced(run.effective, outputs) for run in runs)):
+    if not (by_evidence and ended and all(is_silenced(run.effective, outputs) for run in runs)):
         return starts, runs
     free, ends = make([start._replace(regularization="none") for start in starts])
     usable = [end for end in ends if end.ending.usable]
@@ -118,7 +118,7 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
         return []
     if learned.effective < _SILENT or (values is not None and not values.any()):
         does = "the learner is silent: the fit is that of physics alone"
-    elif values is not None and silenced(learned.effective, bound.ny) and _is_flat(values):
+    elif values is not None and is_silenced(learned.effective, bound.ny) and _is_flat(values):
         does = "the learner has learned nothing but a constant"
     else:
         return []

@@ -58,7 +58,7 @@ Task = TypeVar(
 class SimulationTask(ABC):
     """A problem in segments, and the run of physics alone on it.
 
-    The run is None before `prepared`, and where no run of physics alone is finite.
+    The run is None before `prepare`, and where no run of physics alone is finite.
     """
 
     plan: Any
@@ -86,7 +86,7 @@ class SimulationTask(ABC):
     ) -> list[StartPoint]:
         """Return possible starts of a run from the weights w; arguments as in `estimate`."""
 
-    def prepared(
+    def prepare(
         self: Task, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress = quiet
     ) -> Task:
         """Return the task with physics alone trained.
@@ -106,10 +106,10 @@ class SimulationTask(ABC):
         plan = replace(plan, rms=max(rms, 1e-10 * plan.rms))
         if not np.isfinite(physics.mean_square):
             plan, point = replace(plan, whole=plan.segments), physics.end.point
-            physics = physics._replace(mean_square=plan.alone.mean_square(point.c, point.w))
+            physics = physics._replace(mean_square=plan.physics_only.mean_square(point.c, point.w))
         return replace(self, plan=self.scaled(plan, physics), physics=physics)
 
-    def keeping(self: Task, checkpoints: Checkpoints | None) -> Task:
+    def with_checkpoints(self: Task, checkpoints: Checkpoints | None) -> Task:
         """Return the task with checkpoints of its descents."""
         return replace(self, plan=replace(self.plan, checkpoints=checkpoints))
 
@@ -276,7 +276,7 @@ class SimulationTask(ABC):
         """Return the scores for robust standard errors; None for a run without an end."""
         if run.end.linear is None or not run.end.ending.usable:
             return None
-        objective, point, slope = self.plan.looked_at(run.objective, run.end)
+        objective, point, slope = self.plan.end_in_memory(run.objective, run.end)
         rows = objective.start_rows
         missed = np.moveaxis(objective.initial.measured - point.states, -1, 1)
         return FreeRunScores(

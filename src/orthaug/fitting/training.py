@@ -13,13 +13,19 @@ import numpy as np
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
-from orthaug._base.lines import counted
+from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.estimates import Restart
-from orthaug.fitting.held_out import HeldOutErrors, Pieces, blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import (
+    HeldOutErrors,
+    Pieces,
+    held_out_blocks,
+    mean_square,
+    squared_errors,
+)
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
@@ -45,7 +51,9 @@ class PlannedRun(NamedTuple):
     regularization: str | float
 
 
-def planned(bound: Bound | None, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
+def plan_runs(
+    bound: Bound | None, seeds: range, choices: Sequence[str | float]
+) -> list[PlannedRun]:
     """Return a run from every seed with every regularization; one without a learner."""
     if bound is None:
         return [PlannedRun(seeds.start, np.zeros(0), "none")]
@@ -116,7 +124,7 @@ def train(
         conclude: makes the estimate of a task, a structure and what a run learned.
     """
     with one_blas_thread():
-        task = task.prepared(solver, structure, partial(progress, 0))
+        task = task.prepare(solver, structure, partial(progress, 0))
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
     planned, (starts, runs) = (
         len(starts),
@@ -148,11 +156,12 @@ def train(
                 "physics alone"
             )
     LOG.info("run %d of %d is chosen; 0 is physics alone", best + 1, len(runs))
-    alike = _members(starts, ranking, best) if choice.scored else _alike(starts, best)
+    same = [i for i, one in enumerate(starts) if one.regularization == starts[best].regularization]
+    alike = _members(starts, ranking, best) if choice.scored else same
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
-        estimate = _alone(conclude, task, structure)
+        estimate = _conclude_physics(conclude, task, structure)
     elif choice.ensemble:
         members = alike
         estimate = _conclude(conclude, task, structure, _median(task, runs, members, best))
@@ -172,12 +181,12 @@ def train(
         *replacing,
         *retry_warnings(planned, starts, runs, held_out, best),
     )
-    beside = _beside(conclude, task, structure) if best >= 0 else None
+    beside = _physics_to_compare(conclude, task, structure) if best >= 0 else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
     return replace(estimate, **found, warnings=warnings)
 
 
-def _beside(conclude: Concluding, task: Task, structure: Structure) -> Any:
+def _physics_to_compare(conclude: Concluding, task: Task, structure: Structure) -> Any:
     """Return the estimate of physics alone, to compare with that of a learner.
 
     None without one, and where it costs a pass.
@@ -215,13 +224,6 @@ def _cross_validation(task: Task, run: Any) -> float:
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
 
 
-def _alike(starts: Sequence[PlannedRun], best: int) -> list[int]:
-    """Return the runs with the regularization of the best one."""
-    return [
-        i for i, start in enumerate(starts) if start.regularization == starts[best].regularization
-    ]
-
-
 def _members(starts: Sequence[PlannedRun], ranking: np.ndarray, best: int) -> list[int]:
     """Return the best run from every seed."""
     seeds = dict.fromkeys(start.seed for start in starts)
@@ -247,12 +249,12 @@ def _run_all(
     if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
-    def again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
+    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
         return _run(
             task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
         )
 
-    return add_retries(begun, runs, task.bound.ny, again)
+    return add_retries(begun, runs, task.bound.ny, run_again)
 
 
 def _run(
@@ -310,7 +312,7 @@ def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> 
 def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
     if not count:
         return []
-    text = f"training was stopped on request: {count} of {counted(runs, 'run')} had not ended"
+    text = f"training was stopped on request: {count} of {plural(runs, 'run')} had not ended"
     text += ", and none was tried on held-out blocks" if untried else ""
     return [
         Warning(
@@ -336,7 +338,7 @@ def _held_out(
     if choice.validation is not None:
         record, unit = choice.validation, task.problem.deviation
         fits = [concluded(i) for i in range(len(starts))]
-        alone = _errors(_alone(conclude, task, structure), record, unit)
+        alone = _errors(_conclude_physics(conclude, task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
         return HeldOutErrors(
             "the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits)
@@ -344,7 +346,7 @@ def _held_out(
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
-        folds = blocked(task.problem.record, choice.blocks, task.problem.first_row)
+        folds = held_out_blocks(task.problem.record, choice.blocks, task.problem.first_row)
     except InputError:  # too few rows to leave some out
         LOG.debug(
             "too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks
@@ -370,8 +372,8 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
     try:
-        own = task.on(training).prepared(solver, structure)
-        fits = [_alone(conclude, own, structure)]
+        own = task.on(training).prepare(solver, structure)
+        fits = [_conclude_physics(conclude, own, structure)]
         for start in starts:
             report()
             run = own.run(solver, start.weights, structure, start.regularization)
@@ -402,7 +404,7 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _alone(conclude: Concluding, task: Task, structure: Structure) -> Any:
+def _conclude_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
     rows, learned = task.physics_alone()
     return replace(conclude(rows, structure, learned), criterion=task.criterion)
 
@@ -413,7 +415,7 @@ def _physics_for_comparison(conclude: Concluding, task: Task, structure: Structu
     It is least squares one step ahead, also where θ has a penalty.
     """
     plain = task.criterion.one_step and not structure.projects
-    return _alone(conclude, task, Orthogonal() if plain else structure)
+    return _conclude_physics(conclude, task, Orthogonal() if plain else structure)
 
 
 def _conclude(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
-from orthaug.inference.covariance import mixing
+from orthaug.inference.covariance import mixing_matrix
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.rows import (
     Engine,
@@ -129,7 +129,7 @@ class TrainingRows:
 
         One pass over the rows.
         """
-        mix = mixing(noise)
+        mix = mixing_matrix(noise)
         total = np.asarray(self.engine.sum(MixedGram(self.bound), self.rows, w, mix))
         to_phi = self.problem.projection.to_coordinates
         nt = len(to_phi)
@@ -139,4 +139,6 @@ class TrainingRows:
 
     def physics_middle(self, noise: Matrix) -> Matrix:
         """Return ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for whitened noise covariance."""
-        return np.asarray(self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing(noise)))
+        return np.asarray(
+            self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing_matrix(noise))
+        )

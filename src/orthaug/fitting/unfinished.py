@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from orthaug._base.errors import Warning
-from orthaug._base.lines import counted, percent
+from orthaug._base.lines import percent, plural
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.solvers.limit import Tail, noticeable_in
@@ -46,7 +46,7 @@ def follows_training(structure: Structure, problem: Problem, learned: TrainedLea
     return not whole or structure.measure != Training()
 
 
-def unfinished(learned: TrainedLearner) -> bool:
+def is_unfinished(learned: TrainedLearner) -> bool:
     """Return whether training ended while the loss still fell noticeably."""
     return learned.ending.usable and learned.tail is not None and learned.tail.noticeable
 
@@ -61,7 +61,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
     """Return the warning that there are no intervals, with cause and remedy."""
     assert learned.tail is not None
     text = (
-        f"no intervals: training ended after {counted(learned.tail.done, 'iteration')} while "
+        f"no intervals: training ended after {plural(learned.tail.done, 'iteration')} while "
         f"the loss still fell ({_fall(learned.tail)}), so the parameters may still move by "
         "more than their standard errors. "
     )
@@ -90,17 +90,17 @@ def ending_in_words(ending: Ending, tail: Tail | None) -> str:
         return ""
     words = ""
     if ending is Ending.RUNNING and tail.limit:
-        words = f"training stopped at its limit of {counted(tail.done, 'iteration')}"
+        words = f"training stopped at its limit of {plural(tail.done, 'iteration')}"
         words += f" while the loss was still falling ({_fall(tail)}); the model is usable, "
         words += "more iterations may improve it"
         if not tail.noticeable:
             words = (
-                f"training stopped at its limit of {counted(tail.done, 'iteration')}, and the "
+                f"training stopped at its limit of {plural(tail.done, 'iteration')}, and the "
                 f"loss hardly fell any more ({_fall(tail)})"
             )
     if tail.prolonged:
         past = (
-            f"training went on past its limit of {counted(tail.limit, 'iteration')}, because "
+            f"training went on past its limit of {plural(tail.limit, 'iteration')}, because "
             "the loss still fell"
         )
         words = f"{past}; {words or ending.message}".rstrip("; ")

@@ -59,7 +59,7 @@ def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
     return squares / np.sqrt(np.outer(freedom, freedom))
 
 
-def whitening(noise: Matrix) -> Matrix | None:
+def whitening_matrix(noise: Matrix) -> Matrix | None:
     """Return W with `W Σ Wᵀ = I` (ny, ny).
 
     None for a covariance that is singular, as of outputs without errors.
@@ -68,7 +68,7 @@ def whitening(noise: Matrix) -> Matrix | None:
     return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
 
 
-def mixing(noise: Matrix) -> Matrix:
+def mixing_matrix(noise: Matrix) -> Matrix:
     """Return M with `MᵀM = Σ` (ny, ny), also of a singular covariance."""
     values, vectors = np.linalg.eigh(noise)
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
@@ -79,9 +79,11 @@ def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()
 
     For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
-    Args: middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
-        fixed: entries at a bound. They have NaN; the others' covariance holds with them
-        fixed there.
+    Args:
+        factor: of Φ.
+        middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
+        fixed: entries at a bound. They have NaN; the others' covariance holds with them fixed
+            there.
     """
     nt = len(factor.scale)
     free = [i for i in range(nt) if i not in fixed]
@@ -134,15 +136,19 @@ def interval(
 def joint_covariance(
     problem: Problem, model: Model, convention: str = "calibrated", *, own_units: bool = False
 ) -> Matrix:
-    """Cov of θ̂ and the learner's weights in the orthogonal structure, from the raw `[Φ J̃]`, J̃ = P⊥J; (nθ + nw)².
+    """Return Cov (nθ + nw)² of θ̂ and the learner's weights in the orthogonal structure.
 
+    It is formed from the raw `[Φ J̃]`, J̃ = P⊥J.
     Under the training measure the blocks between θ and weights are zero (`thm:zero_cov`), if all
     outputs have the same noise or share no θ. One pass over the rows.
 
-    Args: convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
-        included. own_units: invert the weights' block by a pseudo-inverse in the weights' own
-        units: of directions whose
-            eigenvalue is rounding beside the largest, there is nothing in the result.
+    Args:
+        problem: rows and physics.
+        model: the fitted model.
+        convention: "paper" for eq:cov_approx divided by N, factor 2 and `Σ̂ = (1/N) Σ e eᵀ`
+            included.
+        own_units: invert the weights' block by a pseudo-inverse in the weights' own units, which
+            leaves out directions whose eigenvalue is rounding beside the largest.
 
     Raises:
         InputError: an unknown convention, or a model without a learner's gradient.
@@ -172,12 +178,14 @@ def joint_covariance(
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
     share = problem.count / len(problem.rows)  # of which the rows in memory are a subsample
     outer, middle = (
-        share * projected_gram(engine, bound, w, rows, m) for m in (np.eye(ny), mixing(whitened))
+        share * projected_gram(engine, bound, w, rows, m)
+        for m in (np.eye(ny), mixing_matrix(whitened))
     )
     change = np.eye(len(outer))
     change[:nt, :nt] = projection.r / projection.scale
     outer, middle = (change.T @ gram @ change for gram in (outer, middle))
-    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular block into θ's
+    # block by block, as in the proof: one inverse of both mixes rounding of the weights' singular
+    # block into θ's
     weights = half_inverse(outer[nt:, nt:], 0, own_units=own_units)
     half: Any = scipy.linalg.block_diag(half_inverse(outer[:nt, :nt], nt), weights)
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
@@ -222,7 +230,9 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 def _variances(
     form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
-    return jax.lax.map(lambda rows: jnp.sum(_along(form, numbers, rows, root) ** 2, axis=0), x)
+    return jax.lax.map(
+        lambda rows: jnp.sum(_slopes_along(form, numbers, rows, root) ** 2, axis=0), x
+    )
 
 
 @partial(jax.jit, static_argnames="form")
@@ -232,13 +242,13 @@ def changes(
     """Return how far each prediction moves along the columns of `root`."""
 
     def one_chunk(rows: Any) -> Any:
-        moved = _along(form, numbers, rows, root)
+        moved = _slopes_along(form, numbers, rows, root)
         return moved.reshape(-1, moved.shape[-1])
 
     return jax.lax.map(one_chunk, x)
 
 
-def _along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
+def _slopes_along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)

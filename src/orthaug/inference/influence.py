@@ -69,7 +69,7 @@ class Influence:
         )
         return cls(rows, root, k @ root, own, float(np.sqrt(count / max(count - used, 1.0))))
 
-    def less_leverage(self, errors: Matrix) -> Matrix:
+    def leave_one_out(self, errors: Matrix) -> Matrix:
         """Return `(I − H_k)⁻¹ e_k` of every row (N, ny).
 
         This is the error that physics fitted without this row leaves of it.
@@ -89,7 +89,7 @@ class Influence:
 
         Of several outputs the smallest, times their number (Bonferroni).
         """
-        errors = self.less_leverage(errors)
+        errors = self.leave_one_out(errors)
         found = [_white_test(self.rows[:, o] @ self.along.T, e) for o, e in enumerate(errors.T)]
         return min(1.0, len(found) * min(found))
 
@@ -156,5 +156,5 @@ def hc3(
         share: how many times more rows were trained on than these, which then represent them.
     """
     influence = Influence.of(slopes, statistics, np.eye(slopes.shape[2]), nt)
-    scores = np.einsum("kon,ko->kn", slopes, influence.less_leverage(errors))
+    scores = np.einsum("kon,ko->kn", slopes, influence.leave_one_out(errors))
     return replace(statistics, middle=share * scores.T @ scores)

@@ -110,7 +110,7 @@ class Measure(Protocol):
         ...
 
 
-def _even(x: Matrix) -> Points:
+def _even_points(x: Matrix) -> Points:
     return Points(x, np.full(len(x), 1 / len(x)))
 
 
@@ -126,7 +126,7 @@ class Training:
 
     def points(self, support: Support) -> Points:
         if self.rows is None:
-            return _even(support.x)
+            return _even_points(support.x)
         start, stop = self.rows
         first = largest_lag(support.layout)
         kept = []
@@ -138,7 +138,7 @@ class Training:
             raise InputError(
                 f"rows {start}:{stop} hold no usable row; the first is at row {first}."
             )
-        return _even(x)
+        return _even_points(x)
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Symmetrized:
 
     def points(self, support: Support) -> Points:
         x = support.x
-        return _even(np.concatenate([x, -x]))
+        return _even_points(np.concatenate([x, -x]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +308,7 @@ def _entries(support: Support) -> str:
 def _rule(coordinates: int) -> Points:
     """Return nodes on [−1, 1]ᵈ with weights that add up to 1, symmetric about 0."""
     if coordinates == 0:
-        return _even(np.zeros((1, 0)))
+        return _even_points(np.zeros((1, 0)))
     if coordinates <= len(_NODES):
         panels = _NODES[coordinates - 1] // _PANEL
         node, weight = np.polynomial.legendre.leggauss(_PANEL)
@@ -324,7 +324,7 @@ def _rule(coordinates: int) -> Points:
     import scipy.stats.qmc  # slow to import, and few boxes have so many coordinates
 
     quasi = 2 * scipy.stats.qmc.Sobol(coordinates, scramble=True, rng=0).random(_QUASI_RANDOM) - 1
-    return _even(np.concatenate([quasi, -quasi]))
+    return _even_points(np.concatenate([quasi, -quasi]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.left_over import UnexplainedPhysics, left_over
 from orthaug.physics.motion import Motion
-from orthaug.physics.shared import Shared, agreeing, moves, spanned
+from orthaug.physics.shared import Shared, agreeing_directions, moves, spanned_directions
 
 _BATCH = 4096  # points at a time
 _ITERATIONS = 30
@@ -75,7 +75,7 @@ class MotionSplit:
     support: float = 1.0
 
     @classmethod
-    def none(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
+    def empty(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
         """Return the split before any: c itself, nothing shared, over no points."""
         nothing = Field(
             np.zeros((0, form.states)),
@@ -122,7 +122,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     before, after = (
         np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after)
     )
-    return Shared(names, agreeing(before, after)).beside(_left_over(form, q, points, nx))
+    return Shared(names, agreeing_directions(before, after)).beside(_left_over(form, q, points, nx))
 
 
 def _left_over(
@@ -140,7 +140,7 @@ def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
     features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
-    return spanned(form.motion.names, slopes, features, _has_learner(form.motion))
+    return spanned_directions(form.motion.names, slopes, features, _has_learner(form.motion))
 
 
 def learned_places(motion: Motion) -> list[int]:
@@ -285,13 +285,13 @@ def slopes_at(
 ) -> Float[Array, "m r np"]:
     """Return ∂(f, h)/∂q at points."""
 
-    def both(q: Any, x: Any, u: Any) -> Any:
+    def value_and_slope(q: Any, x: Any, u: Any) -> Any:
         p = form.motion.coordinates.physical(q, jnp)
         return jnp.concatenate(
             [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
         )
 
-    return jax.vmap(lambda x, u: jax.jacfwd(both)(q, x, u))(x, u)
+    return jax.vmap(lambda x, u: jax.jacfwd(value_and_slope)(q, x, u))(x, u)
 
 
 def _distance(form: MotionDynamics, numbers: Numbers, q: Vector, field: Field) -> float:

@@ -21,7 +21,7 @@ from orthaug.physics.shared import Shared
 _NOTHING = 1e-3
 
 
-def grown(
+def enlarge_covariance(
     covariance: Matrix | None, statistics: Statistics, shared: Shared | None
 ) -> Matrix | None:
     """Return Cov θ̂ (nθ, nθ), larger along directions that the features leave little of.

@@ -20,7 +20,7 @@ from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, Warning
 from orthaug.inference.covariance import interval
 from orthaug.physics.excitation import excitation
-from orthaug.physics.parameters import PhysicsMap, magnitude, tied
+from orthaug.physics.parameters import PhysicsMap, magnitude, tied_text
 
 CONTRADICTION = 0.05  # p-value below which θ̂ contradicts the physics, to match the 95 % intervals
 ITERATIONS = 200  # Levenberg-Marquardt steps from one start
@@ -229,7 +229,7 @@ def solve(
     fit = _Fit.of(physics, theta_hat, covariance)
     value, *others = fit.solutions(starts)
     residual, jacobian = fit.at(value)
-    held = _held(physics, value, jacobian.T @ residual)
+    held = _bound_mask(physics, value, jacobian.T @ residual)
     chi2, df = float(residual @ residual), len(residual) - int(np.sum(~held))
     outside = df == 0 and chi2 > _SOLVED[fit.known]
     sensitivity = excitation(
@@ -244,12 +244,13 @@ def solve(
     consistency = (
         _consistency(chi2, df, freedom, bool(held.any())) if fit.known and df > 0 else None
     )
-    warnings = [*_at_bounds(physics, value, held), *_elsewhere(physics, others)]
+    warnings = [*_at_bounds(physics, value, held), *_other_minima(physics, others)]
     if outside:
         warnings.append(_outside(fit, value))
     elif not sensitivity.full_rank:
         text = (
-            f"At the solution {tied(sensitivity)}; the physical parameters have no standard errors."
+            f"At the solution {tied_text(sensitivity)}; "
+            "the physical parameters have no standard errors."
         )
         warnings.append(Warning("physical_parameters_tied", text))
     if not fit.known:
@@ -275,7 +276,7 @@ def solve(
     )
 
 
-def _held(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
+def _bound_mask(physics: PhysicsMap, value: Vector, gradient: Vector) -> Bool[np.ndarray, "n"]:
     """Return a mask (np,) of the parameters that the data press against a bound."""
     low, high = physics.bounds
     return ((value <= low) & (gradient > 0)) | ((value >= high) & (gradient < 0))
@@ -349,7 +350,7 @@ def _at_bounds(physics: PhysicsMap, value: Vector, held: Bool[np.ndarray, "n"]) 
     ]
 
 
-def _elsewhere(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
+def _other_minima(physics: PhysicsMap, others: Sequence[Vector]) -> list[Warning]:
     if not others:
         return []
     listed = ", ".join(

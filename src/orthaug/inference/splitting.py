@@ -18,7 +18,7 @@ from orthaug.models.learners import Bound
 from orthaug.models.model import Model
 from orthaug.models.rows import InMemory, Overlaps, chunk_shape, learner_rows
 from orthaug.models.statistics import JointCovariance
-from orthaug.models.streaming import chunks_of, summed
+from orthaug.models.streaming import chunks_of, sum_rows
 from orthaug.physics.excitation import require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
@@ -63,7 +63,7 @@ class MeasureSplit:
         )
 
 
-def split_under(
+def split_by_measure(
     measure: Measure, model: Model, support: Support, joint: JointCovariance | None
 ) -> MeasureSplit:
     """Split a model under a measure.
@@ -127,7 +127,7 @@ class _PartitionOverlap:
 
     def __call__(self, partition: Partition) -> Matrix | None:
         chunks = chunks_of(self.row_builder(partition), chunk_shape(partition.rows)[1])
-        found = summed(Overlaps(self.bound), chunks, (self.weights,))
+        found = sum_rows(Overlaps(self.bound), chunks, (self.weights,))
         return None if found is None else np.asarray(found.jacobian)
 
 

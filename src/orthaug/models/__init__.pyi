@@ -1,10 +1,6 @@
 from .cluster import Dask as Dask
-from .devices import Devices as Devices
 from .kalman import Noise as Noise
 from .learners import MLP as MLP
-from .learners import EquinoxModule as EquinoxModule
-from .learners import External as External
-from .learners import Function as Function
 from .model import Model as Model
 from .motion_model import MotionModel as MotionModel
 from .response import Response as Response

@@ -93,17 +93,17 @@ def pull_of(features: Callable[[Matrix], Matrix], points: Matrix) -> Matrix:
     return pull
 
 
-def within(limits: Any, z: Any) -> Any:
+def clip_to_range(limits: Any, z: Any) -> Any:
     """Return the features moved onto the range, z̄ (nz,)."""
     return jnp.clip(z, limits[0], limits[1])
 
 
-def remaining(beyond: str, limits: Any, z: Any) -> Any:
+def remaining_factor(beyond: str, limits: Any, z: Any) -> Any:
     """Return the factor a of the correction at features z (nz,): 1 where it is held."""
     if beyond != "fade":
         return 1.0
     half = (limits[1] - limits[0]) / 2
-    apart = (z - within(limits, z)) / jnp.where(half > 0, half, 1.0)
+    apart = (z - clip_to_range(limits, z)) / jnp.where(half > 0, half, 1.0)
     return jnp.exp(-jnp.sum(apart**2) / FADED**2)
 
 

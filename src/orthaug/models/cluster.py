@@ -28,8 +28,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
 from orthaug._base.parallel import Threads
 from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, build_chunk, chunk_shape, together
-from orthaug.models.streaming import RowArrays, apart, chunks_of, folded, summed
+from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, build_chunk, chunk_shape, join_chunks
+from orthaug.models.streaming import RowArrays, chunks_of, fold_rows, split_chunks, sum_rows
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -72,11 +72,11 @@ class Dask(Threads):
         """Send rows that are in memory here to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
-        chunks = apart(build_chunk(z, q, e, gain, shape))
+        chunks = split_chunks(build_chunk(z, q, e, gain, shape))
         each = -(-len(chunks) // workers)
         with cluster_errors():
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
-            return [self.client.submit(kept, group, pure=False) for group in groups]
+            return [self.client.submit(keep_on_worker, group, pure=False) for group in groups]
 
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
         """Return the partitions of a source, built where they will be summed."""
@@ -84,23 +84,23 @@ class Dask(Threads):
             task = partial(
                 _build_chunks, row_builder=row_builder, size=self.limit
             )  # not scattered: what is lost can be made again
-            return [self._on(task, partition) for partition in source.partitions]
+            return [self._task_on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
-            return self._added(
+            return self._add_sums(
                 [
                     self.client.submit(_partial_sum, function, part, given, pure=False)
                     for part in rows
                 ]
             )
 
-    def _added(self, parts: list[Any]) -> Any:
+    def _add_sums(self, parts: list[Any]) -> Any:
         """Return the sum of partial sums, in their order."""
         while len(parts) > 1:
             groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
-            parts = [self.client.submit(_added, group, pure=False) for group in groups]
+            parts = [self.client.submit(_add_parts, group, pure=False) for group in groups]
         return self.client.gather(parts[0])
 
     @property
@@ -108,7 +108,7 @@ class Dask(Threads):
         return max(len(self.client.nthreads()), 1)
 
     def place(self, chunks: Any, like: Sequence[Any] | None = None) -> ClusterChunks:
-        pieces = apart(chunks)
+        pieces = split_chunks(chunks)
         each = -(-len(pieces) // min(self.shares, len(pieces)))
         whole, rest = divmod(len(pieces), each)
         counts = (
@@ -120,7 +120,8 @@ class Dask(Threads):
         with cluster_errors():
             groups = [pieces[end - count : end] for end, count in zip(ends, counts, strict=True)]
             return ClusterChunks(
-                [self.client.submit(kept, group, pure=False) for group in groups], tuple(counts)
+                [self.client.submit(keep_on_worker, group, pure=False) for group in groups],
+                tuple(counts),
             )
 
     def read(
@@ -128,7 +129,10 @@ class Dask(Threads):
     ) -> ClusterChunks:
         with cluster_errors():
             return ClusterChunks(
-                [self._on(partial(_listed, function), partition) for partition in partitions],
+                [
+                    self._task_on(partial(_chunk_list, function), partition)
+                    for partition in partitions
+                ],
                 tuple(counts),
             )
 
@@ -139,7 +143,7 @@ class Dask(Threads):
             for partition in partitions:
                 held = getattr(partition, "held", ())
                 bare = replace(partition, held=()) if held else partition
-                carry = self.client.submit(_carried, function, bare, carry, *held, pure=False)
+                carry = self.client.submit(_carry_on, function, bare, carry, *held, pure=False)
             return self.client.gather(carry)
 
     def beside(self, *rows: ClusterChunks) -> ClusterChunks:
@@ -150,26 +154,33 @@ class Dask(Threads):
     ) -> tuple[ClusterChunks, Any]:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
-            both = [self.client.submit(_folded, function, part, given, pure=False) for part in rows]
+            both = [
+                self.client.submit(_fold_partition, function, part, given, pure=False)
+                for part in rows
+            ]
             kept, parts = (
                 [self.client.submit(itemgetter(i), one, pure=False) for one in both] for i in (0, 1)
             )
-            return ClusterChunks(kept, rows.counts), self._added(parts)
+            return ClusterChunks(kept, rows.counts), self._add_sums(parts)
 
     def fetch(self, rows: ClusterChunks) -> Any:
         with cluster_errors():
-            return together([chunk for group in self.client.gather(list(rows)) for chunk in group])
+            return join_chunks(
+                [chunk for group in self.client.gather(list(rows)) for chunk in group]
+            )
 
     def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
         """Return a function of every partition, where the workers are."""
         with cluster_errors():
-            return self.client.gather([self._on(function, partition) for partition in partitions])
+            return self.client.gather(
+                [self._task_on(function, partition) for partition in partitions]
+            )
 
     def room(self) -> Room:
         """Return the room of the smallest worker, which may add up a whole branch of the tree."""
         return smallest_worker(self.client, _BRANCHES + 1)
 
-    def _on(self, function: Callable[[Any], Any], partition: Any) -> Any:
+    def _task_on(self, function: Callable[[Any], Any], partition: Any) -> Any:
         """Return a task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
         if not held:
@@ -190,15 +201,15 @@ def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> A
     return function(partition.on(*held))
 
 
-def _listed(function: Callable[[Any], Any], partition: Any) -> list[Any]:
+def _chunk_list(function: Callable[[Any], Any], partition: Any) -> list[Any]:
     return list(function(partition))
 
 
-def _carried(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *held: Any) -> Any:
+def _carry_on(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *held: Any) -> Any:
     return function(partition.on(*held) if held else partition, carry)
 
 
-def kept(value: Any) -> Any:
+def keep_on_worker(value: Any) -> Any:
     """Return the value that a worker keeps.
 
     The scheduler makes it again where that worker is lost.
@@ -206,26 +217,28 @@ def kept(value: Any) -> Any:
     return value
 
 
-def _paired(groups: Any) -> list[Any]:
+def _pair_chunks(groups: Any) -> list[Any]:
     """Return the chunks of a group; of a tuple of groups, tuples of their chunks."""
-    return list(zip(*map(_paired, groups), strict=True)) if isinstance(groups, tuple) else groups
+    return (
+        list(zip(*map(_pair_chunks, groups), strict=True)) if isinstance(groups, tuple) else groups
+    )
 
 
-def _folded(
+def _fold_partition(
     function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]
 ) -> tuple[list[Any], Any]:
     """Return the part of a partition that is kept, and its share of a sum."""
-    return folded(function, _paired(chunks), arguments)
+    return fold_rows(function, _pair_chunks(chunks), arguments)
 
 
 def _partial_sum(
     function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]
 ) -> Any:
     """Return one partition's share of a sum, as NumPy arrays."""
-    return jax.tree.map(np.asarray, summed(function, _paired(chunks), arguments))
+    return jax.tree.map(np.asarray, sum_rows(function, _pair_chunks(chunks), arguments))
 
 
-def _added(parts: Sequence[Any]) -> Any:
+def _add_parts(parts: Sequence[Any]) -> Any:
     total = parts[0]
     for part in parts[1:]:
         total = jax.tree.map(np.add, total, part)
@@ -264,7 +277,7 @@ def cluster_errors() -> Iterator[None]:
         raise InputError(text) from None
 
 
-def connected(scheduler: str | None, workers: int | None) -> Any:
+def connect(scheduler: str | None, workers: int | None) -> Any:
     """Return a client of the scheduler at an address, or of a local cluster.
 
     A local cluster has a process for each core.
@@ -298,13 +311,13 @@ def connected(scheduler: str | None, workers: int | None) -> Any:
                 f"no Dask scheduler answers at {scheduler} ({type(error).__name__})."
             ) from None
     atexit.register(
-        _closed, client, own=scheduler is None
+        _close_client, client, own=scheduler is None
     )  # before distributed's own, which logs what it cancels
     check_versions(client)
     return client
 
 
-def _closed(client: Any, *, own: bool) -> None:
+def _close_client(client: Any, *, own: bool) -> None:
     cluster = client.cluster
     client.close()
     if own:

@@ -25,9 +25,9 @@ from orthaug.models.rows import (
     LocalEngine,
     Room,
     all_chunks,
-    brought,
     build_chunk,
     chunk_shape,
+    read_all_rows,
     row_fold,
 )
 
@@ -58,7 +58,7 @@ class Devices(LocalEngine):
         return self.place(build_chunk(z, q, e, gain, (count * self.shares, size)))
 
     def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
-        return self.build_rows(*brought(source, row_builder))
+        return self.build_rows(*read_all_rows(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return self._run(function, rows, arguments, keeps=False)[1]
@@ -72,21 +72,21 @@ class Devices(LocalEngine):
             _mesh(self.count)[0], jax.sharding.PartitionSpec(_ROWS)
         )
 
-        def sharded(values: Any) -> Any:
+        def shard(values: Any) -> Any:
             held = np.asarray(values)
             return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
 
-        return jax.tree.map(sharded, chunks)
+        return jax.tree.map(shard, chunks)
 
     def read(
         self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
     ) -> Any:
-        def even(part: Any) -> Any:
+        def pad_shares(part: Any) -> Any:
             return np.concatenate(
                 [part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)]
             )
 
-        return self.place(jax.tree.map(even, all_chunks(function, partitions)))
+        return self.place(jax.tree.map(pad_shares, all_chunks(function, partitions)))
 
     def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
         return self._run(function, rows, arguments, keeps=True)
@@ -96,7 +96,7 @@ class Devices(LocalEngine):
     ) -> tuple[Any, Any]:
         with _ONE_AT_A_TIME:
             return jax.block_until_ready(
-                _compiled(function, self.count, len(arguments), keeps)(rows, *arguments)
+                _compile_sum(function, self.count, len(arguments), keeps)(rows, *arguments)
             )
 
     def map(
@@ -130,7 +130,9 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 
 
 @cache
-def _compiled(function: Callable[..., Any], count: int | None, arguments: int, keeps: bool) -> Any:
+def _compile_sum(
+    function: Callable[..., Any], count: int | None, arguments: int, keeps: bool
+) -> Any:
     """Compile a sum: each device adds up its own chunks, then all of them have the total.
 
     With `keeps` each device also returns what it keeps.

@@ -35,7 +35,7 @@ class Numbers(NamedTuple):
     each; None otherwise.
     """
     scheme: Any = None
-    """Results of `Dynamics.prepared` for all steps of a run."""
+    """Results of `Dynamics.prepare` for all steps of a run."""
     limits: Any = None
     """(2, nz), the range of the features over the training rows; None for a learner that goes on as
     it is beyond it.
@@ -51,7 +51,7 @@ class Numbers(NamedTuple):
         return self if self.limits is None else self._replace(limits=None, pull=None)
 
     @property
-    def alone(self) -> Numbers:
+    def physics_only(self) -> Numbers:
         """The numbers of the physics, in the shapes of a fit without a learner.
 
         Programs of such a fit can then be used again.
@@ -165,7 +165,7 @@ class Dynamics(Protocol):
         """Return a state and the inputs of a step by the names that a user knows."""
         ...
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with all that the steps of a run share, computed once."""
         ...
 
@@ -225,7 +225,7 @@ class AutodiffDynamics:
 
     differentiable = True
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
 
     def scaled_features(
@@ -257,17 +257,15 @@ class AutodiffDynamics:
         """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
-        def both(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
+        def value_twice(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
             value = jnp.concatenate([following, parts.total])
-            return (
-                value,
-                value,
-            )  # to differentiate, and as it is: the step stands once in the program
+            # to differentiate, and as it is: the program contains the step once
+            return value, value
 
         unknowns = jnp.concatenate([jnp.asarray(numbers.theta), jnp.asarray(numbers.weights)])
-        differentiated = jax.jacrev(both, (0, 1), has_aux=True)
+        differentiated = jax.jacrev(value_twice, (0, 1), has_aux=True)
         slopes, value = jax.vmap(differentiated, (-1, None, -1), -1)(states, unknowns, inputs)
         # a kink without a derivative, such as sqrt(max(y, 0)) at 0, counts as flat
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))

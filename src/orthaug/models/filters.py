@@ -20,7 +20,7 @@ from orthaug.models.kalman import (
     FilterRow,
     Noise,
     StateEstimate,
-    corrected,
+    correct,
     slope,
     without_gaps,
 )
@@ -97,12 +97,10 @@ class LaggedFilter:
         self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
     ) -> tuple[StateEstimate, FilterRow]:
         n, ny = len(self.memory.lags), len(self.form.outputs)
-        value, derivative = slope(_both(self, numbers, inputs), belief.state)
+        value, derivative = slope(_joint_step(self, numbers, inputs), belief.state)
         enters = jnp.concatenate([jnp.asarray(self._newest), jnp.eye(ny)])
         covariance = derivative @ belief.covariance @ derivative.T + enters @ noise.state @ enters.T
-        mean, after, spread, square, likelihood = corrected(
-            value, covariance, noise.output, measured
-        )
+        mean, after, spread, square, likelihood = correct(value, covariance, noise.output, measured)
         estimated = FilterRow(
             value[n:], spread, mean[n:], after[n:, n:], mean[:n], after[:n, :n], square, likelihood
         )
@@ -148,9 +146,9 @@ class MotionFilter:
         return self.form.states
 
     @property
-    def alone(self) -> MotionFilter:
+    def physics_only(self) -> MotionFilter:
         """The filter of the motion without its learner."""
-        return MotionFilter(self.form.alone)
+        return MotionFilter(self.form.physics_only)
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return self.form.inputs(experiment, record)
@@ -177,9 +175,7 @@ class MotionFilter:
         both = jnp.concatenate([jnp.eye(n), seen])
         covariance = both @ belief.covariance @ both.T
         mean = jnp.concatenate([belief.state, value])
-        mean, after, spread, square, likelihood = corrected(
-            mean, covariance, noise.output, measured
-        )
+        mean, after, spread, square, likelihood = correct(mean, covariance, noise.output, measured)
         following, moved = slope(lambda x: self.step(numbers, x, inputs)[0], mean[:n])
         own = after[:n, :n]
         estimated = FilterRow(
@@ -215,18 +211,18 @@ class MotionFilter:
         )
 
 
-def _both(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
+def _joint_step(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
     """Return the next state and the outputs as one function of the state."""
 
-    def both(state: Any) -> Any:
+    def joint_step(state: Any) -> Any:
         following, parts = form.step(numbers, state, inputs)
         return jnp.concatenate([following, parts.total])
 
-    return both
+    return joint_step
 
 
 def _at_origin(form: Filter, numbers: Numbers, inputs: Vector, n: int) -> tuple[Matrix, Matrix]:
     """Return A (n, n) and C (ny, n) at the origin."""
-    both = _both(form, numbers, inputs)
+    both = _joint_step(form, numbers, inputs)
     derivative = np.asarray(jax.jit(lambda x: slope(both, x)[1])(np.zeros(n)))
     return derivative[:n], derivative[n:]

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import jax
 
 COORDINATOR = "ORTHAUG_COORDINATOR"
@@ -41,7 +41,7 @@ def join(environment: Mapping[str, str] = os.environ) -> None:
     for key, name in _NUMBERS.items():
         text = environment.get(name)
         if text is not None and not text.isdecimal():
-            raise InputError(f"{name}: found {shown(text)}; expected a whole number.")
+            raise InputError(f"{name}: found {show(text)}; expected a whole number.")
         numbers[key] = None if text is None else int(text)
     if numbers["process_id"]:
         _await(address)

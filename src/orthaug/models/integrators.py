@@ -23,7 +23,7 @@ Field = Callable[[Any, Any], Any]
 """F(x (nx,), u (nu,)) → (nx,)."""
 
 
-def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
+def inputs_at_points(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     """Return the inputs (N, nu) at the points of each sample that a step reads, (N, points nu).
 
     One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
@@ -33,16 +33,16 @@ def held(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     if hold == "zero-order" or not nu:
         return inputs
     if hold == "first-order" or rows < 4:
-        return _stacked(inputs, np.concatenate([inputs[1:], inputs[-1:]]))
+        return _interleave(inputs, np.concatenate([inputs[1:], inputs[-1:]]))
     from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
 
     spline, k = CubicSpline(np.arange(rows), inputs), np.arange(rows)
-    return _stacked(
+    return _interleave(
         *(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1))
     )
 
 
-def _stacked(*points: Matrix) -> Matrix:
+def _interleave(*points: Matrix) -> Matrix:
     return np.stack(points, axis=1).reshape(len(points[0]), -1)
 
 
@@ -72,7 +72,7 @@ class Exponentials(NamedTuple):
 
     @classmethod
     def of(cls, linear: Any, h: float) -> Exponentials:
-        """Of A (nx, nx)."""
+        """Return the exponentials of A (nx, nx) over a step h."""
         both = jax.vmap(lambda a: _phi(a, 3))(
             jnp.stack([linear * h, linear * h / 2])
         )  # at once: less to compile
@@ -94,9 +94,17 @@ def advance(
 ) -> Any:
     """Return x one sample later.
 
-    Args: field: ẋ = F(x, u). scheme: the `Exponentials` of its linear part; None for `rk4`. row:
-        the input as `held` lays it out. step: the sampling time. looped: write the field once into
-        a program, and not for every stage: of a large one that compiles faster.
+    Args:
+        field: ẋ = F(x, u).
+        scheme: the `Exponentials` of its linear part; None for `rk4`.
+        x: the state.
+        row: the input as `inputs_at_points` arranges it.
+        nu: number of inputs.
+        step: the sampling time.
+        substeps: of a sample.
+        integrator: "rk4" or "exact".
+        looped: write the field once into a program, and not for every stage: a large one compiles
+            faster so.
     """
     at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
     stages = _stages_in_a_loop if looped else runge_kutta

@@ -102,7 +102,7 @@ def slope(function: Any, at: Any) -> tuple[Any, Any]:
     return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
 
 
-def corrected(
+def correct(
     mean: Any, covariance: Any, noise: Any, measured: Any
 ) -> tuple[Any, Any, Any, Any, Any]:
     """Return mean (n + ny,) and covariance of (state, outputs) after a measurement.
@@ -162,7 +162,7 @@ def _likelihood(
     return jax.lax.scan(row, (belief, jnp.zeros(())), (inputs, measured))[0][1]
 
 
-def filtered(
+def run_filter(
     form: Filter,
     numbers: Numbers,
     noise: Noise,
@@ -175,7 +175,7 @@ def filtered(
     Return the estimates before the rows, and those of the rows.
     """
     rows = len(inputs)
-    found = _all_rows(form, numbers, noise, belief, *_padded(inputs, measured))
+    found = _all_rows(form, numbers, noise, belief, *_pad_rows(inputs, measured))
     before, rows_of = ([np.asarray(part)[:rows] for part in one] for one in found)
     return StateEstimate(*before), FilterRow(*rows_of)
 
@@ -189,10 +189,10 @@ def log_likelihood(
     measured: Matrix,
 ) -> float:
     """Return the log-likelihood of the innovations (Schweppe 1965)."""
-    return float(_likelihood(form, numbers, noise, belief, *_padded(inputs, measured)))
+    return float(_likelihood(form, numbers, noise, belief, *_pad_rows(inputs, measured)))
 
 
-def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
+def _pad_rows(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
     """Pad the rows with copies of the last one in which nothing is measured: they add nothing."""
     more = padded_length(len(inputs)) - len(inputs)
     behind = np.full((more, measured.shape[1]), np.nan)
@@ -202,7 +202,7 @@ def _padded(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 
 
 @partial(jax.jit, static_argnames="form")
-def _ahead(
+def _predict_outputs(
     form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
 ) -> tuple[Parts, Any]:
     """Return the outputs after `horizon` steps from each of m estimates, and their covariances S.
@@ -222,7 +222,7 @@ def _ahead(
     return jax.vmap(one)(beliefs, inputs)
 
 
-def ahead(
+def predict_outputs(
     form: Filter,
     numbers: Numbers,
     noise: Noise,
@@ -246,7 +246,9 @@ def ahead(
             np.concatenate([a[rows], np.repeat(a[rows][-1:], more, axis=0)])
             for a in (*beliefs, windows)
         ]
-        parts, spread = _ahead(form, numbers, noise, StateEstimate(*chosen[:2]), chosen[2], horizon)
+        parts, spread = _predict_outputs(
+            form, numbers, noise, StateEstimate(*chosen[:2]), chosen[2], horizon
+        )
         pieces.append([np.asarray(part)[:count] for part in parts])
         deviations.append(spread_of(np.asarray(spread)[:count]))
     return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True))), np.concatenate(

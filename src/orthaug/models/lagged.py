@@ -21,7 +21,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
-from orthaug.models.beyond import beyond_of, remaining, within
+from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.learners import Bound
 from orthaug.physics.baseline import Baseline
@@ -38,7 +38,7 @@ class Lagged:
     bound: Bound | None
 
     @property
-    def alone(self) -> Lagged:
+    def physics_only(self) -> Lagged:
         """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 
@@ -165,13 +165,13 @@ class Lagged:
         z = self.features.evaluate(x, self.layout, jnp)
         share: Any = 1.0
         if numbers.limits is not None:
-            inside = within(numbers.limits, z)
+            inside = clip_to_range(numbers.limits, z)
             phi = self.baseline.phi(x + numbers.pull @ (inside - z), self.layout, self.outputs, jnp)
-            share, z = remaining(self.beyond, numbers.limits, z), inside
-        raw = _learned(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
+            share, z = remaining_factor(self.beyond, numbers.limits, z), inside
+        raw = _learned_output(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 
@@ -232,7 +232,7 @@ class Lagged:
         return value, slope, back
 
 
-def _learned(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
+def _learned_output(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
     """Return f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
     if numbers.tilt is None:
         return numbers.gain * bound.values(numbers.weights, z)

@@ -14,7 +14,13 @@ from orthaug.data.regressors import Features
 from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
+from orthaug.models.model_arrays import (
+    arrays_of,
+    bound_of,
+    declaration_of,
+    fields_from,
+    model_declaration,
+)
 from orthaug.physics.baseline import Baseline, Parameter, Term
 
 
@@ -23,7 +29,7 @@ def declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     form = model.form
     baseline = form.baseline
     declared = {
-        **said_of(model),
+        **model_declaration(model),
         "layout": [list(lag) for lag in form.layout],
         "features": [
             {"text": e.text, "constants": dict(e.constants)} for e in form.features.entries

@@ -18,7 +18,7 @@ from annotated_types import Ge
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.models.beyond import BEYOND
@@ -95,7 +95,7 @@ class MLP:
         if not isinstance(self.hidden, tuple | list):
             raise InputError(
                 "`hidden` must be a tuple of neurons per layer, such as (16,); got "
-                f"{shown(self.hidden)}."
+                f"{show(self.hidden)}."
             )
         if isinstance(self.inputs, str):
             raise InputError(
@@ -105,7 +105,7 @@ class MLP:
         if not isinstance(self.inputs, list | tuple | None) or any(
             not isinstance(i, str) for i in self.inputs or ()
         ):
-            got = shown(self.inputs)
+            got = show(self.inputs)
             raise InputError(
                 f"`inputs` must be a tuple of expressions, or None for all lags; got {got}."
             )
@@ -113,7 +113,7 @@ class MLP:
         object.__setattr__(self, "inputs", None if self.inputs is None else tuple(self.inputs))
         if any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in self.hidden):
             raise InputError(
-                f"`hidden` must be whole numbers of neurons, 1 or more; got {shown(self.hidden)}."
+                f"`hidden` must be whole numbers of neurons, 1 or more; got {show(self.hidden)}."
             )
         if len(self.hidden) > MOST_LAYERS:
             has = f"`hidden` has {len(self.hidden)} layers"
@@ -180,12 +180,12 @@ def _uniform(key: Array, reach: Vector, count: int) -> Any:
     They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes
     each number from its place alone, so they are those that would be drawn at the layer's own size.
     """
-    drawn = _drawn(key, reach, -(-count // 1024) * 1024)
+    drawn = _draw_uniform(key, reach, -(-count // 1024) * 1024)
     return drawn if is_traced(drawn) else np.asarray(drawn)
 
 
 @partial(jax.jit, static_argnames="count")
-def _drawn(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r count"]:
+def _draw_uniform(key: Array, reach: Float[Array, "r"], count: int) -> Float[Array, "r count"]:
     one = partial(jax.random.uniform, shape=(count,), dtype=float)
     return jax.vmap(lambda key, a: one(key, minval=-a, maxval=a))(
         jax.random.split(key, len(reach)), reach
@@ -387,7 +387,7 @@ class Bound:
             tried = np.asarray(
                 self.ravel([*leaves[:-count], *(jnp.zeros_like(leaf) for leaf in leaves[-count:])])
             )
-            values, slopes = _probed(self, tried)
+            values, slopes = _probe(self, tried)
             if not np.any(values) and np.any(slopes) and np.isfinite(slopes).all():
                 return tried
         return None
@@ -466,7 +466,7 @@ class Bound:
 
 
 @partial(jax.jit, static_argnames="bound")
-def _probed(
+def _probe(
     bound: Bound, w: Float[Array, "nw"]
 ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
     """Return f and ∂f/∂w at some points of the scaled box."""

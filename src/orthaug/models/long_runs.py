@@ -42,7 +42,7 @@ def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
 
 def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
     """Yield the free run along every experiment of a source, from the measured outputs of each."""
-    record, first = as_record(source, (_nothing(source),)), model.form.first_row
+    record, first = as_record(source, (_empty_experiment(source),)), model.form.first_row
     state: Any = None
     ended: tuple[str, int] = ("", -1)
     for piece in pieces_of(model, source):
@@ -50,7 +50,7 @@ def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
             state = model.form.start(piece.outputs[:first], [first])[0]
         run = model.run_parts(state, model.form.inputs(piece, record))
         yield RunPiece(piece, state, run)
-        state = _after(model, state, np.asarray(run.total))
+        state = _state_after(model, state, np.asarray(run.total))
         ended = piece.source, piece.offset + len(piece)
 
 
@@ -59,7 +59,7 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
 
     A run that left all bounds has no more values.
     """
-    record = as_record(source, (_nothing(source),))
+    record = as_record(source, (_empty_experiment(source),))
     if not free:
         for piece in pieces_of(model, source):
             yield piece, model.predict(replace(record, experiments=(piece,)))
@@ -79,14 +79,14 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
         yield piece, Response((run_piece,), None, model.outputs, source.sampling_time)
 
 
-def _after(model: Model, state: Any, outputs: Matrix) -> Any:
+def _state_after(model: Model, state: Any, outputs: Matrix) -> Any:
     """Return the state after outputs (m, ny) of a run that began in a state."""
     before = state.reshape(model.form.memory, len(model.outputs))[::-1]
     past = np.concatenate([before, outputs])
     return model.form.start(past, [len(past)])[0]
 
 
-def _nothing(source: Source) -> Experiment:
+def _empty_experiment(source: Source) -> Experiment:
     return Experiment(np.zeros((0, len(source.inputs))), np.zeros((0, len(source.outputs))))
 
 
@@ -135,7 +135,7 @@ def scores_along(
 
     The first `skip` rows of each recording are left out.
     """
-    record, first = as_record(source, (_nothing(source),)), model.form.first_row
+    record, first = as_record(source, (_empty_experiment(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
     for piece, _, parts in run_pieces(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)

@@ -46,7 +46,7 @@ def _free_run(
 
 
 @partial(jax.jit, static_argnames="form")
-def _ahead(
+def _last_outputs(
     form: Dynamics,
     numbers: Numbers,
     states: Float[Array, "m n0"],
@@ -120,9 +120,12 @@ class Model(RecordModel, NotebookView):
         return self.form.baseline.parameters, self.theta
 
     @property
-    def alone(self) -> Model:
+    def physics_only(self) -> Model:
         """The model without its learner."""
-        return replace(self, form=self.form.alone, numbers=self.numbers.alone)
+        return replace(self, form=self.form.physics_only, numbers=self.numbers.physics_only)
+
+    alone = physics_only
+    """Earlier name of `physics_only`."""
 
     def learner_at(self, x: Float[np.ndarray, "M nx"]) -> Float[np.ndarray, "M ny"]:
         """Return f, before any split, at regressors of the form's layout, in the outputs' units.
@@ -295,7 +298,9 @@ class Model(RecordModel, NotebookView):
             1, _WINDOW_CELLS // max(1, windows[0].size)
         )  # windows overlap: they are copied batch by batch
         return _in_batches(
-            lambda s, u: _ahead(self.form, self.numbers, s, u, horizon), (states, windows), largest
+            lambda s, u: _last_outputs(self.form, self.numbers, s, u, horizon),
+            (states, windows),
+            largest,
         )
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug._base.registry import frozen
+from orthaug._base.registry import freeze
 from orthaug.data.record import Channel, Prepared
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
@@ -22,7 +22,7 @@ from orthaug.models.statistics import Statistics
 _SAID = ("structure", "measure", "sampling_time", "time_column")
 
 
-def said_of(model: Any) -> dict[str, Any]:
+def model_declaration(model: Any) -> dict[str, Any]:
     """Return the declaration that every model has, whatever its physics."""
     channels = {
         kind: [asdict(channel) for channel in getattr(model, kind)]
@@ -113,7 +113,7 @@ def rebuilt_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> 
     if kind in LEARNERS:
         learner = LEARNERS[kind]
         return learner(
-            **{name: frozen(kept[name]) for name in _field_names(learner) if name in kept}
+            **{name: freeze(kept[name]) for name in _field_names(learner) if name in kept}
         )
     if given is not None:
         return given

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.expressions import Expression
-from orthaug.models.beyond import beyond_of, remaining, within
+from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.physics.motion import Motion
@@ -74,7 +74,7 @@ class MotionField:
         """Behaviour of the learner's correction beyond its training range."""
         return "free" if self.bound is None else beyond_of(self.bound.learner, "fade")
 
-    def added(self, numbers: Numbers, x: Any, u: Any) -> Any:
+    def addition(self, numbers: Numbers, x: Any, u: Any) -> Any:
         """Return the learner's addition to the physics at c, at one point.
 
         Learned equations come first, then outputs.
@@ -85,9 +85,9 @@ class MotionField:
         if numbers.limits is None:
             return self.learned(numbers, x, u)
         z = self.seen(x, u)
-        inside = within(numbers.limits, z)
+        inside = clip_to_range(numbers.limits, z)
         moved = numbers.pull @ (inside - z)
-        share = remaining(self.beyond, numbers.limits, z)
+        share = remaining_factor(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
         split, own = (
             self.motion.coordinates.physical(q, jnp)
@@ -116,7 +116,7 @@ class MotionField:
         learned = jnp.zeros(self.states)
         states, _ = self.motion.learned
         if self.bound is not None and states:
-            learned = learned.at[np.array(states)].set(self.added(numbers, x, u)[: len(states)])
+            learned = learned.at[np.array(states)].set(self.addition(numbers, x, u)[: len(states)])
         return physics, learned
 
     def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
@@ -124,7 +124,7 @@ class MotionField:
         y = self.motion.observed(x, u, self.parameters(numbers), jnp)
         states, outputs = self.motion.learned
         if self.bound is not None and outputs:
-            y = y.at[np.array(outputs)].add(self.added(numbers, x, u)[len(states) :])
+            y = y.at[np.array(outputs)].add(self.addition(numbers, x, u)[len(states) :])
         return y
 
     def parameters(self, numbers: Numbers) -> Any:
@@ -184,6 +184,8 @@ def _parts(
     def at(x: Any, u: Any) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)
         whole = physics(numbers.theta - numbers.theta_aux, x, u)
-        return split, whole - split + (form.added(numbers, x, u) if form.bound is not None else 0.0)
+        return split, whole - split + (
+            form.addition(numbers, x, u) if form.bound is not None else 0.0
+        )
 
     return jax.vmap(at)(x, u)

@@ -51,7 +51,7 @@ def _run(
     form: MotionDynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
 ) -> tuple[Float[Array, "T n0"], Float[Array, "T ny"]]:
     """Return states and outputs of a free run."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
 
     def step(state: Any, row: Any) -> tuple[Any, tuple[Any, Any]]:
         following, parts = form.step(numbers, state, row)
@@ -61,7 +61,7 @@ def _run(
 
 
 @partial(jax.jit, static_argnames="form")
-def _last(
+def _last_output(
     form: MotionDynamics,
     numbers: Numbers,
     states: Float[Array, "n0 m"],
@@ -69,7 +69,7 @@ def _last(
     steps: Any,
 ) -> Float[Array, "ny m"]:
     """Return the last output of `steps` of runs side by side."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
     states = jax.lax.fori_loop(
         0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states
@@ -151,11 +151,16 @@ class MotionModel(RecordModel, NotebookView):
         return coordinates.parameters, np.asarray(coordinates.physical(self.theta))
 
     @property
-    def alone(self) -> MotionModel:
+    def physics_only(self) -> MotionModel:
         """The model without its learner."""
         return replace(
-            self, form=self.form.alone, numbers=self.numbers.alone._replace(gain=np.ones(0))
+            self,
+            form=self.form.physics_only,
+            numbers=self.numbers.physics_only._replace(gain=np.ones(0)),
         )
+
+    alone = physics_only
+    """Earlier name of `physics_only`."""
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
         """Simulate the free run from the first row on.
@@ -189,7 +194,7 @@ class MotionModel(RecordModel, NotebookView):
         horizon = check_count(horizon, "horizon", of="steps")
         record = self.fitting(record, need_outputs=True)
         trajectories = [
-            self._ahead(experiment, record, horizon) for experiment in record.experiments
+            self._predict_ahead(experiment, record, horizon) for experiment in record.experiments
         ]
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
@@ -318,7 +323,7 @@ class MotionModel(RecordModel, NotebookView):
         bounded = self.bounded(Parts(whole, nothing, nothing), experiment, measured)
         if self.form.bound is None:
             return bounded
-        alone = self.alone
+        alone = self.physics_only
         run = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
         return (
             run
@@ -380,7 +385,7 @@ class MotionModel(RecordModel, NotebookView):
         rows = rows[: len(inputs)]
         size = max(FIRST_ROWS, self.window)
         windows = Windows(
-            _padded(inputs, size), _padded(rows, size), (np.arange(size) < len(rows))[:, None]
+            _pad(inputs, size), _pad(rows, size), (np.arange(size) < len(rows))[:, None]
         )
         guess = self.form.start(rows, [0]).T
         settled = settle(
@@ -388,13 +393,13 @@ class MotionModel(RecordModel, NotebookView):
         )[0]
         return settled[:, 0]
 
-    def _ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
+    def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         self.check_rows(experiment, horizon)
         window = min(
             self.window, len(experiment) - horizon
         )  # short recordings have at least one prediction
         first = window + horizon - 1
-        outputs, physics = self._predicted(experiment, record, horizon, window)
+        outputs, physics = self._predict_windows(experiment, record, horizon, window)
         nothing = np.zeros_like(outputs)
         ahead = trajectory(Parts(outputs, nothing, nothing), experiment, experiment.outputs, first)
         known = np.full(experiment.outputs.shape, np.nan)
@@ -404,7 +409,7 @@ class MotionModel(RecordModel, NotebookView):
             ahead, baseline=known, learner=learner, learner_before=learner, whole=ahead.model
         )
 
-    def _predicted(
+    def _predict_windows(
         self, experiment: Experiment, record: Record, horizon: int, window: int
     ) -> tuple[Float[np.ndarray, "r ny"], Float[np.ndarray, "r ny"]]:
         """Return the outputs `horizon` steps after each window, of the model and by physics alone.
@@ -442,10 +447,14 @@ class MotionModel(RecordModel, NotebookView):
                 _WINDOW_ITERATIONS,
             )[0]
             ends = [(self.form, self.numbers)]
-            ends += [(self.alone.form, self.alone.numbers)] if self.form.bound is not None else []
+            ends += (
+                [(self.physics_only.form, self.physics_only.numbers)]
+                if self.form.bound is not None
+                else []
+            )
             pieces.append(
                 [
-                    np.asarray(_last(*end, settled, following, steps)).T[: len(chosen)]
+                    np.asarray(_last_output(*end, settled, following, steps)).T[: len(chosen)]
                     for end in ends
                 ]
             )
@@ -453,5 +462,5 @@ class MotionModel(RecordModel, NotebookView):
         return outputs, physics
 
 
-def _padded(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
+def _pad(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
     return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])[..., None]

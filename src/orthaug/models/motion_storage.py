@@ -12,7 +12,13 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import parse_named
 from orthaug.models.learners import Learner
-from orthaug.models.model_arrays import arrays_of, bound_of, declaration_of, fields_from, said_of
+from orthaug.models.model_arrays import (
+    arrays_of,
+    bound_of,
+    declaration_of,
+    fields_from,
+    model_declaration,
+)
 from orthaug.models.motion_model import MotionModel, TrainedSegments
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion, Output, State
@@ -27,7 +33,7 @@ def declare(model: MotionModel) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     form, trained = model.form, model.trained
     declared = {
         "kind": "motion",
-        **said_of(model),
+        **model_declaration(model),
         "motion": _declared_motion(form.motion),
         "features": [entry.text for entry in form.features],
         "learner": declaration_of(form.bound),

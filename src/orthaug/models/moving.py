@@ -15,7 +15,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
-from orthaug.models.integrators import UNROLLED, Exponentials, advance, held, input_at
+from orthaug.models.integrators import UNROLLED, Exponentials, advance, input_at, inputs_at_points
 from orthaug.models.motion_field import MotionField
 from orthaug.physics.motion_problem import guess, layout_of
 
@@ -72,7 +72,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     def physics(x: Any, c: Any) -> Any:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiated(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c)
     to_x, to_c = _finite(to_x), _finite(to_c)
     states, _ = form.motion.learned
     if form.bound is None or not states:
@@ -112,7 +112,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiated(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
     states, outputs = form.motion.learned
     if form.bound is not None and outputs:
@@ -123,7 +123,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
 
 
-def _differentiated(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+def _differentiate(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
     """Return the value and its slopes by x and c.
 
     Few entries are differentiated one at a time, without what an entry does not touch.
@@ -148,7 +148,8 @@ def _finite(slope: Any) -> Any:
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
-_LARGE = 150  # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
+_LARGE = 150
+# operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return layout_of(self.motion)
 
     @property
-    def alone(self) -> MotionDynamics:
+    def physics_only(self) -> MotionDynamics:
         """These dynamics without the learner."""
         return replace(self, features=(), bound=None)
 
@@ -191,7 +192,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        return held(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
+        return inputs_at_points(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """Return states and inputs by name."""
@@ -205,7 +206,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         return _step(self, numbers, state, inputs)
 
-    def _stepped(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def _step_once(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         y = self.observed(numbers, state, self.now(inputs))
         parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
         if self.motion.integrator == "discrete":
@@ -224,7 +225,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         )
         return following, parts
 
-    def prepared(self, numbers: Numbers) -> Numbers:
+    def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with the exponentials of an exact integrator.
 
         Their derivatives are by the coordinates of p.
@@ -288,12 +289,12 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         """
         scheme, by_theta = numbers.scheme
 
-        def following(scheme: Any, state: Any, row: Any) -> Any:
+        def next_state(scheme: Any, state: Any, row: Any) -> Any:
             return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
 
         def along(moved: Any) -> Any:
             return jax.vmap(
-                lambda x, row: jax.jvp(lambda s: following(s, x, row), (scheme,), (moved,))[1],
+                lambda x, row: jax.jvp(lambda s: next_state(s, x, row), (scheme,), (moved,))[1],
                 -1,
                 -1,
             )(state, inputs)
@@ -309,7 +310,7 @@ def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tu
 
     It is traced once, whatever programs contain it; so is the field in it.
     """
-    return form._stepped(numbers, state, inputs)
+    return form._step_once(numbers, state, inputs)
 
 
 @partial(jax.jit, static_argnames="form")

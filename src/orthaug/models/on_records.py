@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug.data.preparation import steps_again
 from orthaug.data.record import Channel, Experiment, Prepared, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
@@ -69,10 +69,10 @@ class RecordModel:
             name = experiment.source or "the record"
             raise InputError(
                 f"{name} has {len(experiment)} rows, too few: the first value is at row "
-                f"{shown(first)}."
+                f"{show(first)}."
             )
 
-    def _wanted(self, with_outputs: bool) -> str:
+    def _describe_wanted(self, with_outputs: bool) -> str:
         """Describe a record of the model's channels in Python."""
         given = {
             "u": ("inputs", self.inputs),
@@ -92,7 +92,7 @@ class RecordModel:
             InputError: a channel is missing, the sampling time differs by more than 0.1 %, or
                 outputs are missing samples and `gaps` are not allowed.
         """
-        check_type(record, Record, "record", self._wanted(need_outputs))
+        check_type(record, Record, "record", self._describe_wanted(need_outputs))
         if not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every "
@@ -127,15 +127,15 @@ def trajectory(
 ) -> Trajectory:
     """Return parts from a row on as a trajectory of the whole experiment."""
 
-    def whole(values: Any) -> Matrix:
+    def pad_rows(values: Any) -> Matrix:
         padded = np.full((len(experiment), values.shape[1]), np.nan)
         padded[first:] = values
         return padded
 
     return Trajectory(
-        whole(parts.baseline),
-        whole(parts.learner),
-        whole(parts.raw),
+        pad_rows(parts.baseline),
+        pad_rows(parts.learner),
+        pad_rows(parts.raw),
         measured,
         first,
         experiment.start_time,

@@ -177,7 +177,7 @@ class InMemory(LocalEngine):
         return self.place(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
-        return self.build_rows(*brought(source, row_builder))
+        return self.build_rows(*read_all_rows(source, row_builder))
 
     def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
         return _compiled_sum(function, rows, arguments)
@@ -215,15 +215,15 @@ def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[An
 
 def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
     """Return the chunks that a function makes of every partition, (k, …) each."""
-    return together([chunk for partition in partitions for chunk in function(partition)])
+    return join_chunks([chunk for partition in partitions for chunk in function(partition)])
 
 
-def together(chunks: Sequence[Any]) -> Any:
+def join_chunks(chunks: Sequence[Any]) -> Any:
     """Join chunks of any pytree into one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
-def brought(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
+def read_all_rows(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
     """Return all rows of a source: features, Q, P⊥Y and gain, (N, …) each."""
     pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))

@@ -34,7 +34,7 @@ class Windows(NamedTuple):
     scored: Any
     """Inputs of each window, (T, m)."""
 
-    def padded(self) -> tuple[Windows, int]:
+    def pad(self) -> tuple[Windows, int]:
         """Return longer and more windows on the device, and T.
 
         Few shapes have programs of their own.
@@ -42,12 +42,12 @@ class Windows(NamedTuple):
         steps, count = np.shape(self.scored)
         more = padded_steps(steps) - steps, -count % _LANES
 
-        def repeated(part: Any) -> Any:
+        def repeat_last(part: Any) -> Any:
             return np.pad(
                 part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge"
             )
 
-        return Windows(*(jax.device_put(repeated(np.asarray(part))) for part in self)), steps
+        return Windows(*(jax.device_put(repeat_last(np.asarray(part))) for part in self)), steps
 
 
 def padded_steps(steps: int) -> int:
@@ -77,9 +77,9 @@ def settle(
     begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / np.asarray(loose, dtype=float) ** 2
-    layout = windows.padded()  # once for all iterations
+    layout = windows.pad()  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
-    matrix, right, misfit = _linearised(form, numbers, begun, layout, weight, begun, prior)
+    matrix, right, misfit = _linearise_windows(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
@@ -87,7 +87,7 @@ def settle(
         if ended.all():
             break
         trial = np.where(ended, best, best + step)
-        there = _linearised(form, numbers, trial, layout, weight, begun, prior)
+        there = _linearise_windows(form, numbers, trial, layout, weight, begun, prior)
         lower = there[2] < misfit
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
@@ -112,7 +112,7 @@ def _steps(
         return np.zeros_like(right).T
 
 
-def _linearised(
+def _linearise_windows(
     form: Dynamics,
     numbers: Numbers,
     states: Matrix,
@@ -147,25 +147,26 @@ def _gram(
 
     The sums are over the first `steps` of the windows.
     """
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     n0, m = states.shape
     directions = jnp.eye(n0)
 
-    def both(state: Any, row: Any) -> Any:
+    def step_and_output(state: Any, row: Any) -> Any:
         following, parts = form.step(numbers, state, row)
         return jnp.concatenate([following, parts.total])
 
-    def sloped(state: Any, row: Any) -> tuple[Any, Any]:
+    def step_with_slopes(state: Any, row: Any) -> tuple[Any, Any]:
         """Return a step and its slopes (n0 + ny, n0)."""
         along = jax.vmap(
-            lambda moved: jax.jvp(lambda x: both(x, row), (state,), (moved,)), out_axes=(None, -1)
+            lambda moved: jax.jvp(lambda x: step_and_output(x, row), (state,), (moved,)),
+            out_axes=(None, -1),
         )
         return along(directions)
 
     def step(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, slopes, gram, square = carry
         inputs, target, there = (part[i] for part in windows)
-        value, slope = jax.vmap(sloped, -1, -1)(state, inputs)
+        value, slope = jax.vmap(step_with_slopes, -1, -1)(state, inputs)
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
         slope: Any = sum(
             slope[:, i, None] * slopes[None, i] for i in range(n0)

@@ -25,14 +25,18 @@ def column_units(gram: Matrix, nt: int) -> Vector:
 
 
 def half_inverse(gram: Matrix, nt: int, *, own_units: bool = False) -> Float[np.ndarray, "n r"]:
-    """H with `H Hᵀ` the inverse of the Gram matrix of `[S_c S_w]` on the directions that the data see.
+    """Return H, with `H Hᵀ` the inverse of a Gram matrix on the directions that the data see.
 
+    The Gram matrix is that of `[S_c S_w]`.
     Products with the inverse are formed from H on both sides: the inverse itself has entries up to
     1e13.
 
-    Args: own_units: ask which directions the data see in the units that the columns have, as a
-        pseudo-inverse does;
-            otherwise after each column was divided by its norm, so that units do not matter.
+    Args:
+        gram: of the columns.
+        nt: number of θ, the leading columns.
+        own_units: ask which directions the data see in the units of the columns, as a
+            pseudo-inverse does; otherwise after each column was divided by its norm, so that units
+            do not matter.
     """
     unit = np.ones(len(gram)) if own_units else column_units(gram, nt)
     values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int
 
 from orthaug._base.checks import Vector
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
@@ -91,7 +91,7 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
         state, inputs = jnp.asarray(state, dtype=float), jnp.asarray(inputs, dtype=float)
     except (TypeError, ValueError):
         raise InputError(
-            f"a step takes two vectors of numbers; got {shown(state)} and {shown(inputs)}."
+            f"a step takes two vectors of numbers; got {show(state)} and {show(inputs)}."
         ) from None
     if state.shape != (states,) or inputs.shape != (count,):
         raise InputError(
@@ -148,7 +148,7 @@ def checked_row(row: Any, first: int, rows: int) -> int:
         row = first
     if isinstance(row, bool) or not isinstance(row, int | np.integer) or not first <= row <= rows:
         raise InputError(
-            f"`row` must be a whole number from {first} to {rows} in this record; got {shown(row)}."
+            f"`row` must be a whole number from {first} to {rows} in this record; got {show(row)}."
         )
     return int(row)
 

@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_arrays
 
 from orthaug import __version__
 from orthaug._base.checks import check_type, is_number
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
 from orthaug.models import lagged_storage, motion_storage
@@ -44,15 +44,14 @@ def check_loaded(model: Any, path: Path) -> None:
     """
     if not is_number(model.sampling_time) or model.sampling_time <= 0:
         raise InputError(
-            f"{path}: its sampling time is {shown(model.sampling_time)}; expected a positive "
-            "number."
+            f"{path}: its sampling time is {show(model.sampling_time)}; expected a positive number."
         )
     for name in ("structure", "measure", "time_column"):
         if not isinstance(getattr(model, name), str | None):
             raise InputError(
-                f"{path}: its {name} is {shown(getattr(model, name))}; expected a word."
+                f"{path}: its {name} is {show(getattr(model, name))}; expected a word."
             )
-    for name, value, shape in _expected(model):
+    for name, value, shape in _expected_arrays(model):
         if value is None:
             raise InputError(f"{path}: the model has no {name}; it was not written by orthaug.")
         array = np.asarray(value)
@@ -71,12 +70,12 @@ def check_loaded(model: Any, path: Path) -> None:
     for entry in getattr(model.form.features, "entries", model.form.features):
         if not isinstance(entry.text, str):
             raise InputError(
-                f"{path}: a learner's input is {shown(entry.text)}; expected an expression."
+                f"{path}: a learner's input is {show(entry.text)}; expected an expression."
             )
     for lag in getattr(model.form, "layout", ()):
         if type(lag.lag) is not int or not 0 <= lag.lag <= _LONGEST_LAG:
             raise InputError(
-                f"{path}: its layout has a lag of {shown(lag.lag)}; expected 0 to "
+                f"{path}: its layout has a lag of {show(lag.lag)}; expected 0 to "
                 f"{_LONGEST_LAG} rows."
             )
     if model.form.differentiable:
@@ -97,7 +96,7 @@ def _check_step(model: Any, path: Path) -> None:
         )
 
 
-def _expected(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
+def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
     """Return names, values and shapes of all arrays that a model computes with.
 
     The shape is None where something else has checked it.
@@ -168,15 +167,15 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
 
 def write(model: Model | MotionModel, folder: Path) -> None:
     """Write the two files into an existing folder."""
-    write_packed(_packed(model), folder / _DECLARATION, folder / _ARRAYS)
+    write_packed(_pack(model), folder / _DECLARATION, folder / _ARRAYS)
 
 
 def digest(model: Model | MotionModel) -> str:
     """Return the sha256 that identifies a model: `checksum` in the file of this version."""
-    return _packed(model)[0]["checksum"]
+    return _pack(model)[0]["checksum"]
 
 
-def _packed(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
+def _pack(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
     """Return the contents of the two files."""
     kind = _KINDS[type(model)]
     declared, arrays = kind.declare(model)

@@ -21,7 +21,14 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
 from orthaug.data.sources import Source, rows_of
-from orthaug.models.rows import CHUNK_ROWS, Chunk, LocalEngine, build_chunk, chunk_shape, together
+from orthaug.models.rows import (
+    CHUNK_ROWS,
+    Chunk,
+    LocalEngine,
+    build_chunk,
+    chunk_shape,
+    join_chunks,
+)
 
 _AHEAD = 3  # chunks that wait to be summed
 
@@ -59,20 +66,20 @@ class Stream(LocalEngine):
         self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
     ) -> list[Chunk]:
         """Keep rows that are in memory as chunks."""
-        return apart(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
+        return split_chunks(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> SourceRows:
         return SourceRows(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
 
     def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
-        return summed(function, rows, arguments)
+        return sum_rows(function, rows, arguments)
 
     @property
     def shares(self) -> int:
         return 1
 
     def place(self, chunks: Any, like: Any = None) -> list[Any]:
-        return apart(chunks)
+        return split_chunks(chunks)
 
     def read(
         self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
@@ -85,10 +92,10 @@ class Stream(LocalEngine):
     def keep(
         self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any
     ) -> tuple[list[Any], Any]:
-        return folded(function, rows, arguments)
+        return fold_rows(function, rows, arguments)
 
     def fetch(self, rows: Iterable[Any]) -> Any:
-        return together(list(rows))
+        return join_chunks(list(rows))
 
     def room(self) -> None:
         """Return None, since all sums are made here."""
@@ -115,18 +122,18 @@ class PairedChunks:
         return zip(*self.rows, strict=True)
 
 
-def apart(chunks: Any) -> list[Any]:
-    """Return the rows of each: the inverse of `together`."""
+def split_chunks(chunks: Any) -> list[Any]:
+    """Return the rows of each: the inverse of `join_chunks`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
 
-def folded(
+def fold_rows(
     function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
 ) -> tuple[list[Any], Any]:
     """Return the first results of function(chunk, *arguments) on the host, and the second's sum."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
-    first, _ = _compiled(function)
+    first, _ = _compile_sum(function)
     kept, total = [], None
     for chunk in read_ahead(rows):
         own, share = jax.tree.map(np.asarray, first(chunk, *arguments))
@@ -135,10 +142,12 @@ def folded(
     return kept, total
 
 
-def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]) -> Any:
+def sum_rows(
+    function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]
+) -> Any:
     """Return Σ function(chunk, *arguments), in the order of the rows."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
-    first, more = _compiled(function)
+    first, more = _compile_sum(function)
     total = None
     for chunk in read_ahead(rows):
         total = first(chunk, *arguments) if total is None else more(total, chunk, *arguments)
@@ -147,7 +156,7 @@ def summed(function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple
 
 
 @cache
-def _compiled(function: Callable[..., Any]) -> tuple[Any, Any]:
+def _compile_sum(function: Callable[..., Any]) -> tuple[Any, Any]:
     """Compile the function, and the addition of its result to a sum."""
 
     def more(total: Any, chunk: Chunk, *arguments: Any) -> Any:

@@ -17,8 +17,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from orthaug._base.jax import jax
-from orthaug._base.parallel import Heard, RunCancelled, each, nobody, one_blas_thread, one_core
-from orthaug.models.cluster import Dask, cluster_errors, kept, smallest_worker
+from orthaug._base.parallel import (
+    Heard,
+    RunCancelled,
+    iterate_results,
+    nobody,
+    one_blas_thread,
+    one_core,
+)
+from orthaug.models.cluster import Dask, cluster_errors, keep_on_worker, smallest_worker
 from orthaug.models.rows import InMemory, Room
 
 _MATRICES = 3  # of a run in memory
@@ -52,7 +59,7 @@ class Tasks(InMemory):
 
         The function, its arguments and results are pickled, `given` once while it is the same.
         """
-        shared = self._shared(given)
+        shared = self._share(given)
         with _heard_on(self.client) as (topic, said):
 
             def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Any:
@@ -64,16 +71,22 @@ class Tasks(InMemory):
                         heard(i, *said[i].popleft())
 
                 return ask(
-                    self.client, look, _made, shared, DoublePrecision((function, item)), topic, i
+                    self.client,
+                    look,
+                    _make_run,
+                    shared,
+                    DoublePrecision((function, item)),
+                    topic,
+                    i,
                 )
 
-            yield from each(one, list(enumerate(items)), places(self.client))
+            yield from iterate_results(one, list(enumerate(items)), places(self.client))
 
     def room(self) -> Room:
         """Return the memory of the smallest worker, which makes whole runs."""
         return smallest_worker(self.client, _MATRICES)
 
-    def _shared(self, given: Any) -> Any:
+    def _share(self, given: Any) -> Any:
         """Return the reference by which workers know `given`."""
         from dask import config
 
@@ -82,7 +95,7 @@ class Tasks(InMemory):
             with cluster_errors(), config.set(_ANY_SIZE):
                 self._sent[id(given)] = (
                     given,
-                    self.client.submit(kept, DoublePrecision(given), pure=False),
+                    self.client.submit(keep_on_worker, DoublePrecision(given), pure=False),
                 )
         return self._sent[id(given)][1]
 
@@ -146,7 +159,7 @@ class DoublePrecision:
     value: Any
 
     def __reduce__(self) -> Any:
-        return _sealed, (_Double(), self.value)  # made in this order there
+        return _seal, (_Double(), self.value)  # made in this order there
 
 
 class _Double:
@@ -160,11 +173,11 @@ def _in_double() -> None:
     _ = jax.config  # what turns it on
 
 
-def _sealed(_: None, value: Any) -> DoublePrecision:
+def _seal(_: None, value: Any) -> DoublePrecision:
     return DoublePrecision(value)
 
 
-def _made(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
+def _make_run(shared: DoublePrecision, asked: DoublePrecision, topic: str, number: int) -> Any:
     """Make a run on a worker.
 
     Its reports go to the client from time to time.

@@ -11,7 +11,7 @@ from annotated_types import Ge
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.data.regressors import Lags
@@ -68,8 +68,7 @@ class Terms:
                 or any(not isinstance(t, str) for t in given)
             ):
                 raise InputError(
-                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got "
-                    f"{shown(given)}."
+                    f"`{name}` must be a tuple of texts, such as ('v[k-1]**3',); got {show(given)}."
                 )
             object.__setattr__(self, name, tuple(given))
         check_fields(self)
@@ -103,7 +102,10 @@ class Terms:
         Raises:
             InputError: too many terms, or an excluded one that is none.
         """
-        return self if not self.degree else replace(self, **_written(self.library(signals)))
+        if not self.degree:
+            return self
+        texts = self.library(signals).texts
+        return replace(self, terms=texts, degree=0, functions=(), exclude=(), inputs=texts)
 
     def library(self, signals: Sequence[str]) -> TermLibrary:
         """Return the terms as products of few factors."""
@@ -143,16 +145,6 @@ class Terms:
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         return jnp.asarray(tree) @ z
-
-
-def _written(library: TermLibrary) -> dict[str, Any]:
-    return {
-        "terms": library.texts,
-        "degree": 0,
-        "functions": (),
-        "exclude": (),
-        "inputs": library.texts,
-    }
 
 
 def over_lags(

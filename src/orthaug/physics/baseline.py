@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import check_label, check_type, check_unique, is_number
-from orthaug._base.errors import LONGEST, InputError, shown
+from orthaug._base.errors import LONGEST, InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import (
     RESERVED,
@@ -44,7 +44,7 @@ class Parameter:
         if not is_number(self.initial):
             raise InputError(
                 f"the initial value of '{self.name}' must be a finite number; got "
-                f"{shown(self.initial)}."
+                f"{show(self.initial)}."
             )
         check_bounds(self.name, self.min, self.max)
 
@@ -53,7 +53,7 @@ def check_parameter_name(name: Any) -> None:
     """Raise InputError unless `name` is an identifier."""
     if not is_identifier(name):
         raise InputError(
-            f"{shown(name)} cannot name a parameter; use letters, digits and underscores, at "
+            f"{show(name)} cannot name a parameter; use letters, digits and underscores, at "
             f"most {LONGEST}, not starting with a digit."
         )
 
@@ -73,7 +73,7 @@ def check_bounds(name: str, low: Any, high: Any) -> None:
     """Raise InputError for bounds of a parameter that are no numbers, empty or reversed."""
     if any(isinstance(b, bool) or not isinstance(b, int | float | np.number) for b in (low, high)):
         raise InputError(
-            f"the bounds of '{name}' must be numbers; got min = {shown(low)}, max = {shown(high)}."
+            f"the bounds of '{name}' must be numbers; got min = {show(low)}, max = {show(high)}."
         )
     if not low < high:
         raise InputError(
@@ -160,7 +160,7 @@ class Baseline(NotebookView):
         if not isinstance(terms, Sequence) or not all(isinstance(term, Term) for term in terms):
             raise InputError(
                 "`terms` must be a list of Terms, such as [Term('a', 'y[k-1]')]; got "
-                f"{shown(terms)}."
+                f"{show(terms)}."
             )
         if not terms:
             raise InputError("the baseline has no terms; give at least one, such as y[k-1].")
@@ -169,13 +169,13 @@ class Baseline(NotebookView):
         for name, value in constants.items():
             if not is_name(name):
                 raise InputError(
-                    f"{shown(name)} cannot name a constant; use letters, digits and "
+                    f"{show(name)} cannot name a constant; use letters, digits and "
                     "underscores, not starting with a digit, and no keyword; "
                     f"{', '.join(sorted(RESERVED))} are taken."
                 )
             if not is_number(value):
                 raise InputError(
-                    f"the constant '{name}' must be a finite number; got {shown(value)}."
+                    f"the constant '{name}' must be a finite number; got {show(value)}."
                 )
         terms = _unify(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
@@ -369,7 +369,7 @@ def _unify(terms: Sequence[Term]) -> list[Term]:
         ):
             if value is not None and not is_number(value):
                 raise InputError(
-                    f"the {what} of '{term.parameter}' must be a finite number; got {shown(value)}."
+                    f"the {what} of '{term.parameter}' must be a finite number; got {show(value)}."
                 )
         for attribute in _SHARED:
             value = getattr(term, attribute)
@@ -377,7 +377,7 @@ def _unify(terms: Sequence[Term]) -> list[Term]:
                 first = said[term.parameter, attribute]
                 raise InputError(
                     f"the terms of '{term.parameter}' disagree on `{attribute}`: "
-                    f"{shown(first)} and {shown(value)}."
+                    f"{show(first)} and {show(value)}."
                 )
     for term in terms:
         if term.fixed and (term.parameter, "initial") not in said:

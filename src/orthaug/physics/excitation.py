@@ -74,7 +74,9 @@ def of_gram(gram: Matrix, names: Sequence[str]) -> Excitation:
 
 
 def tied_columns(directions: Matrix, part: float = 1e-6) -> list[list[int]]:
-    """Return sets of columns tied by some orthonormal directions: connected components of their projector.
+    """Return sets of columns tied by some orthonormal directions.
+
+    They are the connected components of the directions' projector.
 
     Args:
         directions: one a row.

@@ -1,4 +1,4 @@
-"""Parameters of which the data determine a combination only: nearly dependent columns that noise cannot tell apart.
+"""Parameters of which the data determine a combination only: nearly dependent columns.
 
 Columns of a well-sampled record are nearly dependent as a rule (`y[k-1]` and `y[k-2]`, powers of
 one signal), and harmless while the parameters are known. So a small singular value alone is no
@@ -22,7 +22,9 @@ from orthaug.physics.problem import Problem
 
 _HALF_OF_THE_DIGITS = 1e-8  # σ/σmax of the unit-norm columns
 _NEARLY = 1e-4  # σ/σmax from which on dependence alone may be what hides a parameter
-_FEW = 2.5  # independent columns of a set that nearly cancels; polynomials spread over more, and want no term fixed
+_FEW = 2.5
+# independent columns of a set that nearly cancels; polynomials spread over more, and want no term
+# fixed
 _CLEARLY = 4.0  # standard errors from zero
 _PART = (
     0.01  # of the projector onto the nearly dependent directions: a column that takes part in one
@@ -120,7 +122,7 @@ def _warnings(
         least = "at least " if small[-1] <= finest else ""
         text = (
             f"the physics is ill-conditioned on the data (condition {least}{1 / small[-1]:.1e} "
-            f"of the scaled columns): the data hardly tell {listed} apart. What one of them "
+            f"of the scaled columns): the data hardly distinguish {listed}. What one of them "
             f"does is a combination of what the others do, to {least}1 part in "
             f"{inflation:.1e}; its standard error is as many times what it would be alone. Fix "
             "one of them, join them to one parameter, or use data in which they act separately."

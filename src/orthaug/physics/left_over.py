@@ -68,7 +68,7 @@ class UnexplainedPhysics:
         least = 1e-12 * float(direction @ self.whole @ direction)
         return min(float(direction @ self.left @ direction) / size, 1.0) if size > least else 1.0
 
-    def imitated(self, basis: Matrix) -> Matrix:
+    def imitated_directions(self, basis: Matrix) -> Matrix:
         """Return the directions (nθ, s) beyond `basis` that functions of the features imitate.
 
         Single parameters first, then what remains of the others together.
@@ -89,7 +89,7 @@ class UnexplainedPhysics:
 
     def _smallest(self, known: Matrix, others: Sequence[int]) -> Vector | None:
         """Return the direction of least share beside the known ones, if below the limit."""
-        root, size = self._beside(known)
+        root, size = self._unit_coordinates(known)
         if not root.shape[1]:
             return None
         values, vectors = np.linalg.eigh(root.T @ self.left @ root)
@@ -103,7 +103,7 @@ class UnexplainedPhysics:
             return None
         return direction
 
-    def _beside(self, known: Matrix) -> tuple[Matrix, Vector]:
+    def _unit_coordinates(self, known: Matrix) -> tuple[Matrix, Vector]:
         """Return coordinates in which slopes beside known directions have unit size, and sizes.
 
         And the sizes.

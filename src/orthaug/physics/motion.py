@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import check_sampling_constant
@@ -144,7 +144,7 @@ class Motion(NotebookView):
                 parameters that no equation uses, an output that no state enters.
         """
         constants, define = dict(constants or {}), dict(define or {})
-        plain = cls._declared(
+        plain = cls._from_declared(
             states,
             outputs,
             inputs,
@@ -203,15 +203,17 @@ class Motion(NotebookView):
         for name, function in (("f", f), ("h", h)):
             if not callable(function):
                 raise InputError(
-                    f"`{name}` must be a function {name}(x, u, p); got {shown(function)}."
+                    f"`{name}` must be a function {name}(x, u, p); got {show(function)}."
                 )
         states = [State(state) if isinstance(state, str) else state for state in states]
         outputs = [Output(output) if isinstance(output, str) else output for output in outputs]
-        plain = cls._declared(states, outputs, inputs, parameters, {}, integrator, substeps, hold)
+        plain = cls._from_declared(
+            states, outputs, inputs, parameters, {}, integrator, substeps, hold
+        )
         return replace(plain, functions=(f, h))
 
     @classmethod
-    def _declared(
+    def _from_declared(
         cls,
         states: Sequence[State],
         outputs: Sequence[Output],
@@ -229,7 +231,7 @@ class Motion(NotebookView):
         if substeps is not None and not (whole and 1 <= substeps <= MOST_SUBSTEPS):
             raise InputError(
                 f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got "
-                f"{shown(substeps)}."
+                f"{show(substeps)}."
             )
         if integrator == "discrete" and hold != "zero-order":
             raise InputError("a discrete motion has no input between samples; leave `hold` out.")
@@ -272,7 +274,7 @@ class Motion(NotebookView):
                     check_not_sampling_time(name, what)
                 if not is_name(name, FUNCTIONS):
                     raise InputError(
-                        f"{shown(name)} cannot name {what}; use letters, digits and "
+                        f"{show(name)} cannot name {what}; use letters, digits and "
                         "underscores, not starting with a digit, and none of "
                         f"{', '.join(sorted(FUNCTIONS))}."
                     )
@@ -297,7 +299,7 @@ class Motion(NotebookView):
         elif start is not None and not is_number(start):
             raise InputError(
                 f"the start of '{state.name}' must be a finite number or an output; got "
-                f"{shown(start)}."
+                f"{show(start)}."
             )
 
     def _check_used(self) -> None:
@@ -412,7 +414,7 @@ class Motion(NotebookView):
     def values(
         self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
     ) -> dict[str, Any]:
-        """Return what every name stands for; x (nx, …), u (nu, …), p (np,).
+        """Return the value of every name; x (nx, …), u (nu, …), p (np,).
 
         Of the definitions only those that are needed.
         """

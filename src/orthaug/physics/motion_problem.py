@@ -69,7 +69,7 @@ class MotionProblem:
         return replace(self, record=record)
 
     @cached_property
-    def looked_at(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
+    def guessed_points(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
         """Guessed states and inputs at some rows of the record."""
         states, inputs = [], []
         share = max(1, _LOOKED_AT // len(self.record.experiments))
@@ -90,7 +90,7 @@ class MotionProblem:
         Raises:
             InputError: functions that return another shape.
         """
-        motion, (x, u) = self.motion, self.looked_at
+        motion, (x, u) = self.motion, self.guessed_points
         with np.errstate(all="ignore"):
             rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
             outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
@@ -121,8 +121,8 @@ class MotionProblem:
 
     @cached_property
     def modes(self) -> Complex[np.ndarray, "m nx"]:
-        """The eigenvalues of ∂f/∂x at the initial parameters [1/s], at the guessed states where they are finite."""
-        x, u = self.looked_at
+        """Eigenvalues of ∂f/∂x [1/s] at the initial parameters and the finite guessed states."""
+        x, u = self.guessed_points
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
         with np.errstate(all="ignore"):
@@ -140,7 +140,7 @@ class MotionProblem:
 
     @property
     def fastest(self) -> float:
-        """The largest |eigenvalue| of ∂f/∂x at the initial parameters [1/s], over the guessed states."""
+        """Largest |eigenvalue| of ∂f/∂x [1/s] at the initial parameters and guessed states."""
         return float(np.abs(self.modes).max(initial=0.0))
 
     @property
@@ -256,9 +256,10 @@ def _check_exact(problem: MotionProblem) -> None:
         )
     if fast > _FASTEST:
         raise InputError(
-            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the motion, "
-            f'{problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a substep, at most {_FASTEST}. '
-            f"Give `substeps` (at most {MOST_SUBSTEPS}), check units and initial values, or leave the fast mode out."
+            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the "
+            f'motion, {problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a '
+            f"substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), check units "
+            "and initial values, or leave the fast mode out."
         )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 
 CHOICES = ("auto", "none", "std", "covariance")
 _SMALLEST, _LARGEST = (
@@ -92,16 +92,16 @@ def check_output_weights(choice: Any, ny: int) -> None:
     )
     listed = isinstance(choice, Sequence) or (isinstance(choice, np.ndarray) and choice.ndim > 0)
     if not listed or any(isinstance(w, bool | str) for w in choice):
-        raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
+        raise InputError(f"`output_weights` is {show(choice)}; {expected}.")
     try:
         values = np.asarray(choice, dtype=float)
     except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
     if values.shape != (ny,) or not np.all(np.isfinite(values) & (values > 0)):
-        raise InputError(f"`output_weights` is {shown(choice)}; {expected}.")
+        raise InputError(f"`output_weights` is {show(choice)}; {expected}.")
     if values.min() < _SMALLEST * values.max():
         raise InputError(
-            f"`output_weights` {shown(choice)} differ by more than {_LARGEST:g}; leave the "
+            f"`output_weights` {show(choice)} differ by more than {_LARGEST:g}; leave the "
             "output out instead."
         )
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, shown
+from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import Baseline, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
@@ -33,10 +33,10 @@ def _complex_arctan2(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.arctan2(np.real(a), np.real(b)) + 1j * slope / (np.real(a) ** 2 + np.real(b) ** 2)
 
 
-# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the complex
-# step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The functions of
-# numpy are analytic, these seven are not. They take the branch of the real part: at a kink that is
-# the slope of one side.
+# The functions that `Expression.evaluate` uses of numpy, on p + ih: Im θ / h is dθ/dp by the
+# complex step (Squire & Trapp 1998), exact up to rounding whatever the scales of p are. The
+# functions of numpy are analytic, these seven are not. They take the branch of the real part: at a
+# kink that is the slope of one side.
 _COMPLEX = SimpleNamespace(
     asarray=lambda x, dtype=None: np.asarray(x, dtype=complex),
     abs=lambda x: np.where(np.real(x) < 0, -1.0, 1.0) * x,
@@ -294,7 +294,7 @@ def check_parameters(
             )
     for name, value in constants.items():
         if not is_number(value):
-            raise InputError(f"the constant '{name}' must be a finite number; got {shown(value)}.")
+            raise InputError(f"the constant '{name}' must be a finite number; got {show(value)}.")
     for p in parameters:
         check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
@@ -303,7 +303,7 @@ def check_parameters(
             )
         if not is_number(p.initial):
             raise InputError(
-                f"the initial value of '{p.name}' must be a finite number; got {shown(p.initial)}."
+                f"the initial value of '{p.name}' must be a finite number; got {show(p.initial)}."
             )
         check_label(p.unit, f"the unit of '{p.name}'")
         check_bounds(p.name, p.min, p.max)
@@ -353,13 +353,13 @@ def _check_identifiable(physics: PhysicsMap) -> None:
             best = sensitivity
     if best is not None and not best.full_rank:
         raise InputError(
-            f"theta does not determine the physical parameters: {tied(best)} "
+            f"theta does not determine the physical parameters: {tied_text(best)} "
             f"({len(physics.theta_names)} theta, rank {best.rank} of {best.columns}). Make one "
             "of them a constant, or add a term that distinguishes them."
         )
 
 
-def tied(sensitivity: Excitation) -> str:
+def tied_text(sensitivity: Excitation) -> str:
     """Return the parameters that θ does not separate, in words."""
     return "; ".join(
         f"{group[0]} has no effect"

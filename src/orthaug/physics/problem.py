@@ -207,7 +207,7 @@ class Problem:
         """
         return np.sum(self.projection.q**2, axis=(0, 2))
 
-    def seen_linearly(self) -> Problem:
+    def for_linear_learner(self) -> Problem:
         """Return the problem for a learner that is a linear combination of its features."""
         return (
             self
@@ -232,7 +232,7 @@ class Problem:
         """Return the problem with the same physics and features on another record."""
         return _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
 
-    def weighed(self, weight: OutputWeights) -> Problem:
+    def weigh(self, weight: OutputWeights) -> Problem:
         """Return the problem with other output weights."""
         if weight is self.weight:
             return self

@@ -74,7 +74,7 @@ class Shared:
         """Return these directions and those that the rows do not separate from the features."""
         if rest is None:
             return self
-        more = rest.imitated(self.basis)
+        more = rest.imitated_directions(self.basis)
         if not more.shape[1]:
             return replace(self, rest=rest)
         moved = [
@@ -113,7 +113,7 @@ class Shared:
             )
         return tuple(described)
 
-    def leaving(self, held: Iterable[int]) -> Shared:
+    def without_entries(self, held: Iterable[int]) -> Shared:
         """Return the shared directions that leave some entries of θ unchanged.
 
         In reduced form too.
@@ -147,7 +147,7 @@ def shared_directions(
         with np.errstate(all="ignore"):
             phi = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
             z = np.asarray(features.evaluate(x, layout, np))
-        return spanned(names, np.moveaxis(phi, 1, 0), z)
+        return spanned_directions(names, np.moveaxis(phi, 1, 0), z)
     read = set(baseline.lags) if baseline.function is None else set(layout)
     if not names or not features.entries or _sees(features, read):
         return everything
@@ -162,12 +162,12 @@ def shared_directions(
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     with np.errstate(all="ignore"):
         own = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
-        return Shared(names, agreeing(before, after)).beside(
+        return Shared(names, agreeing_directions(before, after)).beside(
             left_over(own, _values(features, layout)(x))
         )
 
 
-def spanned(
+def spanned_directions(
     names: tuple[str, ...],
     slopes: Float[np.ndarray, "k N nt"],
     features: Float[np.ndarray, "N nz"],
@@ -184,10 +184,10 @@ def spanned(
     size = np.sqrt(np.mean(slopes**2, axis=(1, 2), keepdims=True))
     slopes, left = (part / np.where(size > 0, size, 1.0) for part in (slopes, left))
     flat, changed = (part.reshape(-1, len(names)) for part in (slopes, slopes + left))
-    return Shared(names, agreeing(flat, changed))
+    return Shared(names, agreeing_directions(flat, changed))
 
 
-def seen(
+def seen_columns(
     features: Features,
     layout: Layout,
     x: Float[np.ndarray, "N nx"],
@@ -237,7 +237,7 @@ def _sees(features: Features, lags: Iterable[Lag]) -> bool:
     return {str(lag) for lag in lags} <= {str(entry) for entry in features.entries}
 
 
-def agreeing(before: Matrix, after: Matrix) -> Matrix:
+def agreeing_directions(before: Matrix, after: Matrix) -> Matrix:
     """Return the directions a with `before a = after a`, relative to `before a`, reduced."""
     if not before.size:  # of no points at all, as of a run that diverged
         return np.zeros((before.shape[1], 0))

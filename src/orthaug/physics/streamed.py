@@ -60,7 +60,7 @@ class Form:
         """Rows of history that a row needs."""
         return largest_lag(self.layout)
 
-    def posed(
+    def pose_pieces(
         self, partition: Partition
     ) -> Iterator[tuple[Experiment, UsableRows, np.ndarray, np.ndarray]]:
         """Return the pieces with their rows, Φ (m, ny, nθ) and sums of the fixed terms (m, ny)."""
@@ -71,7 +71,7 @@ class Form:
             rows = UsableRows(x, piece.outputs[self.lead :], self.layout, self.lead)
             yield piece, rows, *self.baseline.on(x, self.layout, self.outputs)
 
-    def checked(
+    def check_features(
         self, piece: Experiment, rows: UsableRows, phi: np.ndarray, known: np.ndarray
     ) -> Matrix:
         """Return the learner's features (m, nz), after a check that all values are finite."""
@@ -110,8 +110,8 @@ class PartitionSurvey:
 
     def __call__(self, partition: Partition) -> Survey | None:
         found = None
-        for piece, rows, phi, known in self.form.posed(partition):
-            z = self.form.checked(piece, rows, phi, known)
+        for piece, rows, phi, known in self.form.pose_pieces(partition):
+            z = self.form.check_features(piece, rows, phi, known)
             seen = Survey(
                 Extent.of(np.concatenate([piece.outputs, piece.inputs], axis=1)),
                 Extent.of(z),
@@ -134,7 +134,7 @@ class Factoring:
     def __call__(self, partition: Partition) -> Matrix:
         n = len(self.scale) + 1
         r = np.zeros((0, n))
-        for _, rows, phi, known in self.form.posed(partition):
+        for _, rows, phi, known in self.form.pose_pieces(partition):
             columns = self.weight.rows(phi).reshape(-1, n - 1) * self.scale
             target = self.weight.rows(rows.y - known).reshape(-1, 1)
             r = _triangle([r, np.concatenate([columns, target], axis=1)])
@@ -183,16 +183,16 @@ class PartitionQR:
 
     def __call__(self, partition: Partition) -> SecondQR | None:
         basis, found, nt = self.basis, None, len(self.coordinates)
-        for _, rows, phi, known in basis.form.posed(partition):
+        for _, rows, phi, known in basis.form.pose_pieces(partition):
             q = basis.rows(phi)
             e = basis.left(rows.y - known, q, self.coordinates)
             r = _triangle([np.concatenate([q.reshape(-1, nt), e.reshape(-1, 1)], axis=1)])
             seen = SecondQR(r, Moments.of(e), np.sum(q**2, axis=(0, 2)))
-            found = seen if found is None else _both(found, seen)
+            found = seen if found is None else _join_factors(found, seen)
         return found
 
 
-def _both(one: SecondQR, other: SecondQR) -> SecondQR:
+def _join_factors(one: SecondQR, other: SecondQR) -> SecondQR:
     return SecondQR(
         _triangle([one.r, other.r]), one.errors | other.errors, one.freedom + other.freedom
     )
@@ -233,7 +233,7 @@ class RowBuilder:
         self, partition: Partition
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         form = self.basis.form
-        for _, rows, phi, known in form.posed(partition):
+        for _, rows, phi, known in form.pose_pieces(partition):
             q = self.basis.rows(phi)
             e = self.basis.left(rows.y - known, q, self.coordinates) / self.rms
             z = (
@@ -320,10 +320,10 @@ class StreamedProblem(Problem):
         return (
             alone
             if isinstance(alone, StreamedProblem)
-            else streamed(alone, self.source, self.passes)
+            else stream_problem(alone, self.source, self.passes)
         )
 
-    def weighed(self, weight: OutputWeights) -> Problem:
+    def weigh(self, weight: OutputWeights) -> Problem:
         if weight is self.weight:
             return self
         return _factorise(
@@ -353,13 +353,13 @@ def pose_streamed(
     """
     require = options.pop("require_full_rank", True)
     seen = pose(record, baseline, *args, **options, require_full_rank=False)
-    found = streamed(seen, source, passes)
+    found = stream_problem(seen, source, passes)
     if require:
         require_rank(found.excitation, found.count * len(found.outputs))
     return found
 
 
-def streamed(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
+def stream_problem(seen: Problem, source: Source, passes: Passes) -> StreamedProblem:
     """Return the problem of a source, from the problem of a subsample of it."""
     empty = replace(seen.record, experiments=(seen.record.experiments[0].rows(0, 0),))
     form = Form(seen.baseline, seen.features, seen.layout, empty)
@@ -392,7 +392,7 @@ def _factorise(
         r, coordinates = np.eye(nt), np.zeros(nt)
     inverse = scale[:, None] * scipy.linalg.solve_triangular(r, np.eye(nt)) if nt else r
     basis = Basis(form, weight, inverse, np.eye(nt))
-    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _both)
+    second = _merge(passes(PartitionQR(basis, coordinates), source.partitions), _join_factors)
     turn, rest = (second.r[:nt, :nt], second.r[:nt, nt]) if ready else (np.eye(nt), np.zeros(nt))
     back = np.linalg.inv(turn)
     basis = replace(basis, turn=back)

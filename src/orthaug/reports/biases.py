@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.lines import counted, plain_number
+from orthaug._base.lines import plain_number, plural
 from orthaug.reports.findings import SuspectResult
 from orthaug.reports.result import ParameterResult
 
@@ -71,12 +71,14 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     )
     shares = np.where(np.abs(shares) < _ZERO, 0.0, shares)
     size = np.nan_to_num(np.abs(shares))
-    columns = _largest(size.max(axis=0), _MOST_COLUMNS)
-    rows = _largest(size[:, columns].max(axis=1, initial=0.0), _MOST_CELLS // max(len(columns), 1))
+    columns = _largest_indices(size.max(axis=0), _MOST_COLUMNS)
+    rows = _largest_indices(
+        size[:, columns].max(axis=1, initial=0.0), _MOST_CELLS // max(len(columns), 1)
+    )
     shown = [suspects[i].name for i in rows]
     parts = [
-        (len(rows), counted(len(suspects), "suspect")),
-        (len(columns), counted(len(names), "parameter")),
+        (len(rows), plural(len(suspects), "suspect")),
+        (len(columns), plural(len(names), "parameter")),
     ]
     fewer = " and ".join(
         f"{count} of {whole}" for count, whole in parts if count < int(whole.partition(" ")[0])
@@ -89,7 +91,7 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
     )
 
 
-def _largest(size: np.ndarray, most: int) -> list[int]:
+def _largest_indices(size: np.ndarray, most: int) -> list[int]:
     """Return the indices of the largest values, in their order."""
     return sorted(np.argsort(-size, kind="stable")[:most].tolist())
 

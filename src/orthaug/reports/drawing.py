@@ -55,11 +55,11 @@ def plain(draw: Callable[Drawn, Figure]) -> Callable[Drawn, Figure]:
     """Return a function that draws in the style of this package."""
 
     @wraps(draw)
-    def drawn(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
+    def draw_styled(*arguments: Drawn.args, **options: Drawn.kwargs) -> Figure:
         with _own_style():
             return draw(*arguments, **options)
 
-    return drawn
+    return draw_styled
 
 
 def axes_for(ax: Axes | None) -> Axes:
@@ -77,10 +77,10 @@ def axes_for(ax: Axes | None) -> Axes:
 
         made = pyplot.figure
     figure = made(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
-    return ruled(figure.add_subplot())
+    return rule_axes(figure.add_subplot())
 
 
-def ruled(axis: Axes) -> Axes:
+def rule_axes(axis: Axes) -> Axes:
     """Return axes with a faint grid, and no frame above and beside it."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
@@ -125,7 +125,7 @@ def grid(
     place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)
     axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place, **options)
     for axis in axes.flat:
-        ruled(axis)
+        rule_axes(axis)
     return axes
 
 

@@ -65,7 +65,7 @@ def plot(
     check_type(path, str | os.PathLike | None, "path", "a file's name")
     if path is not None and Path(path).suffix.lower() != ".png":
         raise InputError(f"{path}: figures are written as PNG; give a name that ends in .png.")
-    figure = _drawn(what, kind, title)
+    figure = _draw(what, kind, title)
     if path is not None:
         from orthaug.reports import plots
 
@@ -76,7 +76,7 @@ def plot(
     return figure
 
 
-def _drawn(what: Any, kind: str, title: str | None) -> Figure:
+def _draw(what: Any, kind: str, title: str | None) -> Figure:
     from orthaug.reports import finding_plots, linear_plots, plots
 
     if isinstance(what, Linearization):
@@ -144,7 +144,9 @@ class FitPlots:
         response, i = self._response("simulate", record, output, experiment)
         axis = self._outputs(response, i, experiment, "free run", ax)
         if self.fit.model.form.bound is not None:
-            alone = self.fit.model.alone.simulate(self._record(record)).trajectories[experiment]
+            alone = self.fit.model.physics_only.simulate(self._record(record)).trajectories[
+                experiment
+            ]
             limits = axis.get_ylim()
             time = np.arange(len(alone.model)) * response.sampling_time
             drawn = outline(time, alone.model[:, i])
@@ -222,9 +224,9 @@ class FitPlots:
         Raises:
             InputError: a fit without a learner; names that it does not have.
         """
-        part = self._learned()
+        part = self._learned_part()
         feature = check_choice(
-            part.ranked()[0] if feature is None else feature, part.features, "`feature`"
+            part.rank()[0] if feature is None else feature, part.features, "`feature`"
         )
         bare = [name.partition(" [")[0] for name in part.names]
         i = 0 if output is None else bare.index(check_choice(output, bare, "`output`"))
@@ -238,7 +240,7 @@ class FitPlots:
             alpha=0.6,
             label="at the training data",
         )
-        curve = None if part.tied(feature) else part.curve(feature)
+        curve = None if part.is_tied(feature) else part.curve(feature)
         if curve is None:
             centres, means = part.means(feature)
             axis.plot(
@@ -401,7 +403,7 @@ class FitPlots:
         axis.legend(fontsize="small", frameon=False)
         return axis
 
-    def _learned(self) -> LearnedPart:
+    def _learned_part(self) -> LearnedPart:
         part = learned_of(self.fit, self.fit.problem.record) if self.fit.status.ok else None
         if part is None:
             raise InputError("nothing was learned beside the physics; there is nothing to draw.")

@@ -56,7 +56,7 @@ def residual_analysis_figure(
         label(own, x="lag [samples]", y="autocorrelation")
         _correlations(crossed, test)
         label(crossed, x="lag behind the input [samples]", y="correlation with the inputs")
-        for name, curve in test.most_telling.items():
+        for name, curve in test.strongest.items():
             centres, means, errors = (
                 _floats(values) for values in (curve.centres, curve.means, curve.errors)
             )

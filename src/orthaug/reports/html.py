@@ -22,14 +22,16 @@ from orthaug.reports.result import FitResult
 # Colours are the notebook's own, so that a card is read on light and on dark.
 _TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
 <style>.orthaug table{border-collapse:collapse;margin:.4em 0;font-variant-numeric:tabular-nums}\
-.orthaug th,.orthaug td{text-align:left;padding:.15em .8em .15em 0;border-bottom:1px solid rgba(128,128,128,.35)}\
+.orthaug th,.orthaug td{text-align:left;padding:.15em .8em .15em 0;\
+border-bottom:1px solid rgba(128,128,128,.35)}\
 .orthaug th{font-weight:600}.orthaug .facts{opacity:.8}.orthaug p{margin:.2em 0}</style>
 <p><strong>{{ card.title }}</strong></p>
 {% for name, value in card.facts.items() %}
 <p class="facts">{{ name }}: {{ value }}</p>
 {% endfor %}
 {% for table in card.tables if table.rows %}
-<table><thead><tr>{% for head in table.columns %}<th scope="col">{{ head }}</th>{% endfor %}</tr></thead><tbody>
+<table><thead><tr>{% for head in table.columns %}<th scope="col">{{ head }}</th>{% endfor %}\
+</tr></thead><tbody>
 {% for row in table.rows %}
 <tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
 {% endfor %}
@@ -67,13 +69,13 @@ def html_of(shown: Any) -> str:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
     )
     card = shown if isinstance(shown, Card) else card_of(shown)
-    tables = [Table(t.columns, _shortened(t)) for t in card.tables]
+    tables = [Table(t.columns, _shorten_table(t)) for t in card.tables]
     return environment.from_string(_TEMPLATE).render(
         card=Card(card.title, card.facts, tables, card.notes)
     )
 
 
-def _shortened(table: Table) -> Sequence[Sequence[str]]:
+def _shorten_table(table: Table) -> Sequence[Sequence[str]]:
     more = len(table.rows) - _MOST_ROWS
     if more <= 1:
         return table.rows
@@ -131,7 +133,9 @@ def _baseline(baseline: Baseline) -> Card:
     if any(t.output for t in baseline.terms):  # else there is only one
         columns = ["output", *columns]
         rows = [[t.output or "–", *row] for t, row in zip(baseline.terms, rows, strict=True)]
-    return Card("Baseline", _facts(facts), [Table(columns, rows), _declared(baseline.parameters)])
+    return Card(
+        "Baseline", _facts(facts), [Table(columns, rows), _declared_table(baseline.parameters)]
+    )
 
 
 @card_of.register
@@ -155,13 +159,13 @@ def _motion(motion: Motion) -> Card:
     return Card(
         "Motion",
         _facts(facts),
-        [equations, Table(["defined", "as"], defined), _declared(motion.parameters)],
+        [equations, Table(["defined", "as"], defined), _declared_table(motion.parameters)],
     )
 
 
 @card_of.register(Estimate)
 @card_of.register(MotionEstimate)
-def _fit(fit: Estimate | MotionEstimate) -> Card:
+def _fit_card(fit: Estimate | MotionEstimate) -> Card:
     bound, status = fit.model.form.bound, fit.status
     facts = {
         "structure": fit.model.structure,
@@ -223,7 +227,7 @@ def _model(model: Model | MotionModel) -> Card:
     return Card(type(model).__name__, _facts(facts), [Table(["parameter", "value", "unit"], rows)])
 
 
-def _declared(parameters: Sequence[Any]) -> Table:
+def _declared_table(parameters: Sequence[Any]) -> Table:
     """Return the parameters as they were declared."""
     rows = []
     for p in parameters:

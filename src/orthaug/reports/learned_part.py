@@ -86,7 +86,7 @@ class LearnedPart:
     ) -> LearnedPart:
         """Return the learned part of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
-        chosen = spread(len(states))
+        chosen = spread_indices(len(states))
         points, size = np.concatenate([states, inputs], axis=1)[chosen], states.shape[1]
 
         def at(x: Matrix) -> Matrix:
@@ -121,7 +121,7 @@ class LearnedPart:
         rows = np.concatenate(
             [form.regressors(experiment, record) for experiment in record.experiments]
         )
-        points = rows[spread(len(rows))]
+        points = rows[spread_indices(len(rows))]
         of_channel = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
         units = {str(lag): of_channel.get(lag.channel, "") for lag in form.layout}
         features = tuple(str(entry) for entry in form.features.entries)
@@ -155,12 +155,12 @@ class LearnedPart:
         half = None if self.reach is None else self.reach(rows)
         return Curve(along, (along >= low) & (along <= high), self.at(rows), half)
 
-    def telling_pair(self) -> tuple[str, str]:
+    def leading_pair(self) -> tuple[str, str]:
         """Return the feature that explains most, and of those that are not tied to it the next.
 
         There are at least two features.
         """
-        first, *others = self.ranked()
+        first, *others = self.rank()
         own = self.seen[:, self.features.index(first)]
         for name in others:
             other = self.seen[:, self.features.index(name)]
@@ -168,7 +168,7 @@ class LearnedPart:
                 return first, name
         return first, others[0]
 
-    def tied(self, feature: str, but: str = "") -> bool:
+    def is_tied(self, feature: str, but: str = "") -> bool:
         """Return whether the data move another feature along with it, except the feature `but`.
 
         Then no data show its effect with the other at rest.
@@ -184,10 +184,10 @@ class LearnedPart:
             abs(np.corrcoef(own, other)[0, 1]) > _TIED for other in others
         )
 
-    def alone(self, across: str, along: str) -> bool:
+    def is_separable(self, across: str, along: str) -> bool:
         """Return whether two features are variables that can be varied with all else at rest."""
         known = across in self.variables and along in self.variables
-        return known and not self.tied(across, along) and not self.tied(along, across)
+        return known and not self.is_tied(across, along) and not self.is_tied(along, across)
 
     def means(self, feature: str) -> tuple[Vector, Matrix]:
         """Return means of feature (k,) and learned part (k, nl) in bins of equally many points."""
@@ -201,7 +201,7 @@ class LearnedPart:
         total = np.maximum(self.values.var(axis=0), 1e-300)
         return np.array([self.means(feature)[1].var(axis=0) / total for feature in self.features])
 
-    def ranked(self) -> Sequence[str]:
+    def rank(self) -> Sequence[str]:
         """Return the features, the one that explains most of the learned part first."""
         order = np.argsort(-self.shares().max(axis=1), kind="stable")
         return [self.features[j] for j in order]
@@ -214,7 +214,7 @@ class LearnedPart:
         pair = self.seen[:, [self.features.index(across), self.features.index(along)]]
         low, high = pair.min(axis=0), pair.max(axis=0)
         width = np.maximum(high - low, 1e-300)
-        alone = self.alone(across, along)
+        alone = self.is_separable(across, along)
         count = (
             _CELLS if alone else min(max(int(np.sqrt(len(pair) / _IN_A_CELL)), _CELLS // 4), _CELLS)
         )
@@ -228,7 +228,7 @@ class LearnedPart:
             batch = max(len(self.points), _BATCH)  # of as many there is a program
             found = [self.at(rows[start : start + batch]) for start in range(0, len(rows), batch)]
             learned = np.concatenate(found).reshape(size, size, -1)
-            near = np.repeat(np.repeat(_near(cells), _FINER, axis=0), _FINER, axis=1)
+            near = np.repeat(np.repeat(_cells_near_data(cells), _FINER, axis=0), _FINER, axis=1)
             learned = np.where(near[..., None], learned, np.nan)
         else:
             learned = _mean_in_cells(cells, self.values, count)
@@ -252,7 +252,7 @@ def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | 
     )
 
 
-def _near(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
+def _cells_near_data(cells: np.ndarray) -> Bool[np.ndarray, "a b"]:
     """Return the cells with data, and those beside them."""
     there = np.zeros((_CELLS + 2, _CELLS + 2), dtype=bool)
     for i in (0, 1, 2):
@@ -268,7 +268,7 @@ def _mean_in_cells(cells: np.ndarray, values: Matrix, size: int) -> Float[np.nda
     return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)
 
 
-def spread(count: int, most: int = _MOST_POINTS) -> np.ndarray:
+def spread_indices(count: int, most: int = _MOST_POINTS) -> np.ndarray:
     """Return at most so many indices, spread evenly over `count`."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 

@@ -159,7 +159,9 @@ class LinearizeResult(ResultHeader):
                 "output_names": list(first.outputs),
                 "held": found.held,
                 "points": [_point(view, found) for view in found],
-                "measured": None if found.measured is None else _measured(found.measured, first),
+                "measured": None
+                if found.measured is None
+                else _measured_entry(found.measured, first),
                 "warnings": list(found.warnings),
             }
         )
@@ -243,7 +245,7 @@ def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     return fields
 
 
-def _measured(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:
+def _measured_entry(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:
     phases = phase_of(measured.value)
     pairs = [
         {

@@ -89,7 +89,11 @@ def _draw_pair(
         )
         phase = phase + turn
         upper.plot(
-            bode.frequency, size, color=colour, linewidth=1.2, label=f"model{_at(found, number)}"
+            bode.frequency,
+            size,
+            color=colour,
+            linewidth=1.2,
+            label=f"model{_point_label(found, number)}",
         )
         lower.plot(bode.frequency, phase, color=colour, linewidth=1.2)
         if bode.magnitude_ci95 is not None and bode.phase_ci95 is not None:
@@ -116,7 +120,7 @@ def _draw_pair(
     _log_labels(lower.xaxis, sparse=True)
 
 
-def _at(found: Linearization, number: int) -> str:
+def _point_label(found: Linearization, number: int) -> str:
     return "" if len(found) == 1 else f" at point {number}"
 
 

@@ -29,7 +29,7 @@ def linear_text(found: Linearization) -> str:
     for i, view in enumerate(found):
         head = "operating point" if len(found) == 1 else f"operating point {i + 1} of {len(found)}"
         outside = ", outside of the training data" if view.point.outside else ""
-        blocks.append([f"{head}: {_at(view)} ({_stability(view)}{outside})"])
+        blocks.append([f"{head}: {_point_text(view)} ({_stability(view)}{outside})"])
         if i == 0 and found.held in _HELD:
             blocks[0].append(_HELD[found.held])
         blocks += [
@@ -58,10 +58,10 @@ def _stability(view: LinearView) -> str:
     return "not stable" if largest > 1 + 1e-9 else "at the limit of stability"
 
 
-def _at(view: LinearView) -> str:
+def _point_text(view: LinearView) -> str:
     named = view.point.outputs | view.point.values
     order = [*view.inputs, *(name for name in named if name not in view.inputs)]
-    return ", ".join(f"{name} = {_shown(named[name])}{_unit(view, name)}" for name in order)
+    return ", ".join(f"{name} = {named[name] + 0.0:.6g}{_unit(view, name)}" for name in order)
 
 
 def _unit(view: LinearView, name: str) -> str:
@@ -185,7 +185,3 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
 
 def _interval(ends: Any) -> str:
     return "" if ends is None else f"[{ends[0]:.5g}, {ends[1]:.5g}]"
-
-
-def _shown(value: float) -> str:
-    return f"{value + 0.0:.6g}"

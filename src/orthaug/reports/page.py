@@ -59,11 +59,11 @@ def compare_page(page: ComparePage) -> str:
 def _title(what: str, outputs: Sequence[str], spec: Mapping[str, Any], origin: Origin) -> str:
     """Return the title of a page; it omits a spec that is called just that."""
     inputs = spec.get("data", {}).get("inputs") or []
-    title = f"{what} of {_listed(outputs)}" + (f" from {_listed(inputs)}" if inputs else "")
+    title = f"{what} of {_list_names(outputs)}" + (f" from {_list_names(inputs)}" if inputs else "")
     return title if origin.name == "spec" else f"{title}: {origin.name}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     return ", ".join([*names[:_MOST_NAMES], *(["…"] if len(names) > _MOST_NAMES else [])])
 
 
@@ -90,17 +90,17 @@ def _page(
         origin=origin,
         number_of={id(plot): i for i, plot in enumerate(plots)},
         key=id,
-        ticked=_ticked,
+        ticked=_code_markup,
         prose=prose,
         kind_of=lambda block: type(block).__name__,
         style=_template("page.css"),
         script=_template("page.js"),
-        figures=_embedded([_figure(plot) for plot in plots]),
+        figures=_embed([_figure(plot) for plot in plots]),
         plotly=_plotly(),
     )
 
 
-def _ticked(text: str) -> Markup:
+def _code_markup(text: str) -> Markup:
     """Return markup with code for text between backticks, and the minus signs of the tables."""
     parts = [
         Markup("<code>{}</code>").format(part) if i % 2 else escape(prose(part))
@@ -119,7 +119,7 @@ def _figure(plot: Plot) -> dict[str, Any]:
     }
 
 
-def _embedded(content: Any) -> str:
+def _embed(content: Any) -> str:
     """Return JSON for a script element: finite, and without anything that would end the element."""
     text = json.dumps(_finite(content), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

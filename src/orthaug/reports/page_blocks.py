@@ -123,7 +123,7 @@ CATEGORIES = {"autorange": "reversed", "automargin": True, "type": "category"}
 """Plotly's axis of names, the first one at the top."""
 
 
-def titled(x: str, y: str) -> dict[str, Any]:
+def axis_titles(x: str, y: str) -> dict[str, Any]:
     """Return Plotly's layout of two axes with titles and no legend."""
     return {"xaxis": {"title": {"text": x}}, "yaxis": {"title": {"text": y}}, "showlegend": False}
 
@@ -133,10 +133,10 @@ def area(color: str, **place: Any) -> dict[str, Any]:
     return {"type": "rect", **place, "fillcolor": color, "line": {"width": 0}, "layer": "below"}
 
 
-def rounded(values: Any, digits: int = 6) -> list[Any]:
+def round_values(values: Any, digits: int = 6) -> list[Any]:
     """Return numbers, or rows of them, rounded for drawing; None for what is not finite."""
     if np.ndim(values) > 1:
-        return [rounded(row, digits) for row in values]
+        return [round_values(row, digits) for row in values]
     return [
         float(f"{v:.{digits}g}") if math.isfinite(v) else None
         for v in np.asarray(values, dtype=float).tolist()

@@ -12,13 +12,13 @@ from orthaug.reports.page_blocks import (
     CATEGORIES,
     Plot,
     area,
+    axis_titles,
     chance,
     number,
     parameter_label,
     percent,
     regressor_label,
-    rounded,
-    titled,
+    round_values,
     with_unit,
 )
 from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
@@ -50,9 +50,11 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         first = {
             "95 % interval": i == 0,
             "estimate": i == 0,
-            "initial value": i == _first(drawn, _near),
+            "initial value": i == _first_row(drawn, _is_near),
         }
-        first["95 % interval less the bias"] = i == _first(drawn, lambda r: bool(r.ci95_with_bias))
+        first["95 % interval less the bias"] = i == _first_row(
+            drawn, lambda r: bool(r.ci95_with_bias)
+        )
         for trace in _interval_traces(row):
             own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
             traces.append({**own, **trace, "showlegend": first[trace["name"]]})
@@ -114,7 +116,7 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
     found.append(
         {"name": "estimate", "x": [row.value], "y": [0], "mode": "markers", "marker": circle}
     )
-    if _near(row):
+    if _is_near(row):
         diamond = {"color": "@measured", "size": 9, "symbol": "diamond"}
         found.append(
             {
@@ -128,7 +130,7 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
     return found
 
 
-def _first(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
+def _first_row(rows: Sequence[ParameterResult], holds: Callable[[ParameterResult], bool]) -> int:
     """Return the number of the first row for which a condition holds."""
     return next((i for i, row in enumerate(rows) if holds(row)), 0)
 
@@ -153,14 +155,14 @@ def _reach(row: ParameterResult) -> list[float]:
         row.value,
         *(row.ci95 or ()),
         *(row.ci95_with_bias or ()),
-        row.initial if _near(row) else None,
+        row.initial if _is_near(row) else None,
     ]
     known = [end for end in ends if end is not None]
     margin = 0.35 * max(max(known) - min(known), 1e-300)
     return [min(known) - margin, max(known) + margin]
 
 
-def _near(row: ParameterResult) -> bool:
+def _is_near(row: ParameterResult) -> bool:
     low, high = row.ci95 or (None, None)
     if row.initial is None or low is None or high is None or row.value is None:
         return False
@@ -277,7 +279,7 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
             f"Autocorrelation of the {what} of {test.name}; the band holds 99 % of the values "
             f"that noise gives. The largest in size is {number(test.strongest_acf, 2)}."
         )
-        layout = titled("lag [samples]", "autocorrelation") | {
+        layout = axis_titles("lag [samples]", "autocorrelation") | {
             "shapes": [_band(test.acf_band)],
             "showlegend": True,
         }
@@ -311,14 +313,14 @@ def residual_plots(test: ResidualTestResult, what: str, units: Mapping[str, str]
             f"Correlation of the {what} of {test.name} with the inputs; beyond the band it is "
             "more than noise."
         )
-        layout = titled("lag behind the input [samples]", "correlation") | {
+        layout = axis_titles("lag behind the input [samples]", "correlation") | {
             "shapes": [_band(test.cross_band)]
         }
         layout["showlegend"] = True
         label = f"Correlation of the {what} of {test.name} with the inputs."
         plots.append(Plot(label, caption, traces, layout, 280, small=True))
     return plots + [
-        _means_plot(test, name, curve, what, units) for name, curve in test.most_telling.items()
+        _means_plot(test, name, curve, what, units) for name, curve in test.strongest.items()
     ]
 
 
@@ -343,7 +345,7 @@ def _means_plot(
         f"{percent(curve.share)} of its variance."
     )
     label = f"Mean of the {what} of {test.name} over {name}."
-    layout = titled(
+    layout = axis_titles(
         regressor_label(name, units), with_unit(f"residual of {test.name}", units.get(test.name))
     )
     return Plot(label, caption, [dots], layout, 280, small=True)
@@ -356,7 +358,7 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
         "type": "heatmap",
         "x": list(shown.parameters),
         "y": list(shown.suspects),
-        "z": rounded(shown.colours, 5),
+        "z": round_values(shown.colours, 5),
         "zmin": -shown.reach,
         "zmax": shown.reach,
         "text": shown.cells,
@@ -400,7 +402,7 @@ def restart_plot(restarts: Sequence[RestartResult]) -> Plot | None:
     wide = bool(losses) and max(losses) > _DECADES * min(losses) > 0
     seeds = [str(run.seed) for run in restarts]
     names = seeds if len(set(seeds)) == len(seeds) else place
-    layout = titled("seed" if names is seeds else "seed, regularization", "loss")
+    layout = axis_titles("seed" if names is seeds else "seed, regularization", "loss")
     shown = range(0, len(restarts), 1 + len(restarts) // 12)
     layout["xaxis"] |= {"tickvals": [i + 1 for i in shown], "ticktext": [names[i] for i in shown]}
     layout["yaxis"] = {"title": {"text": "loss"}, "type": "log" if wide else "linear"}

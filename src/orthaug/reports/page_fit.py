@@ -100,7 +100,7 @@ def fit_sections(page: FitPage) -> list[Section]:
         Section("parameters", "Parameters", _parameters(result)),
         Section("free-run", "Free run", _runs(page)),
         Section("share", "Physics and learner", _shares(page)),
-        Section("learned", "What was learned", _learned(page)),
+        Section("learned", "What was learned", _learned_blocks(page)),
         Section("residuals", "Residual tests", residuals_blocks(result, page.units)),
         Section("stability", "Stability", stability_blocks(result)),
         Section("excitation", "Excitation and suspects", excitation_blocks(result)),
@@ -359,7 +359,7 @@ def _part_shares(
     return found
 
 
-def _learned(page: FitPage) -> list[Any]:
+def _learned_blocks(page: FitPage) -> list[Any]:
     if page.learned is None or not page.learned.features:
         return []
     return list(learned_blocks(page.learned, page.result.measure or ""))

@@ -6,8 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits, spread
-from orthaug.reports.page_blocks import Grid, Plot, Text, area, percent, rounded, titled, with_unit
+from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits, spread_indices
+from orthaug.reports.page_blocks import (
+    Grid,
+    Plot,
+    Text,
+    area,
+    axis_titles,
+    percent,
+    round_values,
+    with_unit,
+)
 
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
@@ -18,7 +27,7 @@ _LEVEL = 0.02  # share of the learned part below which an input is said to expla
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
     """Return the curves over the inputs, by the share that each explains, and the surface."""
     shares = part.shares()
-    ranked = list(part.ranked())
+    ranked = list(part.rank())
     blocks: list[Text | Grid | Plot] = [Text(_introduction(part, ranked, shares, measure))]
     plots = [
         _curve_plot(part, k, feature, shares[part.features.index(feature), k])
@@ -33,7 +42,7 @@ def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
             )
         )
     if len(ranked) > 1:
-        blocks += [_surface_plot(part, k, *part.telling_pair()) for k in range(len(part.names))]
+        blocks += [_surface_plot(part, k, *part.leading_pair()) for k in range(len(part.names))]
     return blocks
 
 
@@ -58,12 +67,12 @@ def _introduction(part: LearnedPart, ranked: list[str], shares: Any, measure: st
 def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
     j = part.features.index(feature)
     name, axis = part.names[k], with_unit(feature, part.units[j])
-    few = spread(len(part.seen), _CLOUD)
+    few = spread_indices(len(part.seen), _CLOUD)
     cloud = part.seen[few, j], part.values[few, k]
     traces: list[dict[str, Any]] = [
         {
-            "x": rounded(cloud[0]),
-            "y": rounded(cloud[1]),
+            "x": round_values(cloud[0]),
+            "y": round_values(cloud[1]),
             "mode": "markers",
             "name": "training data",
             "marker": {"color": "@measured", "size": 4},
@@ -74,7 +83,7 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         "yaxis": {"title": {"text": name}},
         "shapes": [],
     }
-    curve = None if part.tied(feature) else part.curve(feature)
+    curve = None if part.is_tied(feature) else part.curve(feature)
     text, one = f"Over {feature}", len(part.features) == 1
     if curve is not None:
         traces += _curve_traces(curve, k)
@@ -94,8 +103,8 @@ def _curve_plot(part: LearnedPart, k: int, feature: str, share: float) -> Plot:
         centres, means = part.means(feature)
         traces.append(
             {
-                "x": rounded(centres),
-                "y": rounded(means[:, k]),
+                "x": round_values(centres),
+                "y": round_values(means[:, k]),
                 "mode": "lines+markers",
                 "name": "mean",
                 "line": {"color": "@learner", "width": 2},
@@ -114,7 +123,7 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     if curve.half is not None:
         edge: dict[str, Any] = {
-            "x": rounded(along),
+            "x": round_values(along),
             "mode": "lines",
             "line": {"width": 0, "color": "@band"},
             "hoverinfo": "skip",
@@ -122,7 +131,7 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
         found.append(
             {
                 **edge,
-                "y": rounded(learned - curve.half[:, k]),
+                "y": round_values(learned - curve.half[:, k]),
                 "showlegend": False,
                 "name": "lower limit",
             }
@@ -130,7 +139,7 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
         found.append(
             {
                 **edge,
-                "y": rounded(learned + curve.half[:, k]),
+                "y": round_values(learned + curve.half[:, k]),
                 "fill": "tonexty",
                 "name": "95 % interval",
                 "fillcolor": "@learned-band",
@@ -139,8 +148,8 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     line = {"color": "@learner", "width": 2}
     found.append(
         {
-            "x": rounded(along),
-            "y": rounded(learned),
+            "x": round_values(along),
+            "y": round_values(learned),
             "mode": "lines",
             "showlegend": False,
             "name": "beyond the data",
@@ -150,8 +159,8 @@ def _curve_traces(curve: Curve, k: int) -> list[dict[str, Any]]:
     inside = curve.inside
     found.append(
         {
-            "x": rounded(along[inside]),
-            "y": rounded(learned[inside]),
+            "x": round_values(along[inside]),
+            "y": round_values(learned[inside]),
             "mode": "lines",
             "name": "learner",
             "line": line,
@@ -168,27 +177,27 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
     units = dict(zip(part.features, part.units, strict=True))
     heat = {
         "type": "heatmap",
-        "x": rounded(surface.across),
-        "y": rounded(surface.along),
+        "x": round_values(surface.across),
+        "y": round_values(surface.along),
         "hoverongaps": False,
-        "z": rounded(values, 5),
+        "z": round_values(values, 5),
         "zmin": -reach,
         "zmax": reach,
         "colorscale": "@diverging",
         "colorbar": {"title": {"text": part.names[k], "side": "top"}, "thickness": 14},
     }
-    few = spread(len(part.seen), _CLOUD)
+    few = spread_indices(len(part.seen), _CLOUD)
     points = {
-        "x": rounded(part.seen[few, part.features.index(across)]),
+        "x": round_values(part.seen[few, part.features.index(across)]),
         "mode": "markers",
         "name": "training data",
-        "y": rounded(part.seen[few, part.features.index(along)]),
+        "y": round_values(part.seen[few, part.features.index(along)]),
         "hoverinfo": "skip",
         "marker": {"color": "@ink", "size": 2, "opacity": 0.45},
     }
     how = (
         "all else at its median"
-        if part.alone(across, along)
+        if part.is_separable(across, along)
         else "the mean of the training data in each cell"
     )
     caption = (
@@ -196,7 +205,7 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         f"explain much of it, {how}. It is drawn where training data are near; the dots are these "
         "data."
     )
-    layout = titled(with_unit(across, units[across]), with_unit(along, units[along]))
+    layout = axis_titles(with_unit(across, units[across]), with_unit(along, units[along]))
     return Plot(
         f"Learned part of {part.names[k]} over {across} and {along}.",
         caption,

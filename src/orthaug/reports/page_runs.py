@@ -74,15 +74,20 @@ def compared_plots(responses: Mapping[str, Mapping[str, Response]]) -> list[Plot
     )
     most = MOST_POINTS if 2 * count * outputs < _BUDGET else most
     return [
-        _compared(part, {k: runs[part] for k, runs in responses.items() if part in runs}, most)
+        _comparison_plot(
+            part, {k: runs[part] for k, runs in responses.items() if part in runs}, most
+        )
         for part in parts
     ]
 
 
-def _compared(part: str, runs: Mapping[str, Response], most: int) -> Plot:
+def _comparison_plot(part: str, runs: Mapping[str, Response], most: int) -> Plot:
     first = next(iter(runs.values()))
     panels = _Panels(first, most)
-    models = {name: joined(run, [t.model for t in run.trajectories]) for name, run in runs.items()}
+    models = {
+        name: join_experiments(run, [t.model for t in run.trajectories])
+        for name, run in runs.items()
+    }
     for i in range(len(first.outputs)):
         own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
         if panels.measured is not None:
@@ -150,7 +155,7 @@ def _points_per_curve(lengths: Sequence[int], budget: int) -> int:
     return MOST_POINTS
 
 
-def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
+def pack_curve(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dict[str, Any]:
     """Return a curve at even steps as the page reads it.
 
     A longer one is kept as the minimum and maximum of each stretch.
@@ -178,7 +183,7 @@ def packed(values: Vector, x0: float, dx: float, most: int = MOST_POINTS) -> dic
     }
 
 
-def joined(response: Response, values: Sequence[Matrix | None]) -> Matrix:
+def join_experiments(response: Response, values: Sequence[Matrix | None]) -> Matrix:
     """Return the experiments one after another, with a gap between."""
     gap = np.full((1, len(response.outputs)), np.nan)
     pieces = [np.asarray(piece, dtype=float) for piece in values if piece is not None]
@@ -197,7 +202,9 @@ class _Panels:
         several = len(response.trajectories) > 1
         self.start = 0.0 if several else response.trajectories[0].start_time
         measured = [t.measured for t in response.trajectories]
-        self.measured = None if any(m is None for m in measured) else joined(response, measured)
+        self.measured = (
+            None if any(m is None for m in measured) else join_experiments(response, measured)
+        )
         self.rows = sum(len(t.model) + 1 for t in response.trajectories) - 1
         self.traces: list[dict[str, Any]] = []
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
@@ -206,7 +213,7 @@ class _Panels:
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
         """Return the name by which traces find the curve of output i."""
-        self.series[f"{name} {i}"] = packed(values[:, i], self.start, self.step, self.most)
+        self.series[f"{name} {i}"] = pack_curve(values[:, i], self.start, self.step, self.most)
         return f"{name} {i}"
 
     def add_residual(self, name: str, i: int, model: Matrix, drawn: Mapping[str, Any]) -> None:
@@ -215,7 +222,7 @@ class _Panels:
         own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
         if len(model) > self.most:
             key = f"measured {i} − {name} {i}"
-            self.series[key] = packed(
+            self.series[key] = pack_curve(
                 self.measured[:, i] - model[:, i], self.start, self.step, self.most
             )
             own = {"series": key}
@@ -315,9 +322,11 @@ def curves_left(
 
 def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
     response, panels = run.response, _Panels(run.response, most)
-    model = joined(response, [t.model for t in response.trajectories])
+    model = join_experiments(response, [t.model for t in response.trajectories])
     alone = (
-        None if run.alone is None else joined(response, [t.model for t in run.alone.trajectories])
+        None
+        if run.alone is None
+        else join_experiments(response, [t.model for t in run.alone.trajectories])
     )
     curves = {"measured": panels.measured, "physics": alone, "model": model}
     drawn = {"the model": model} | ({} if alone is None else {f"the {WITHOUT}": alone})
@@ -381,16 +390,16 @@ def _axes(i: int, panels: int, channel: Channel, limits: list[float] | None) -> 
     top = 1 - i * high
     middle = top - (high - _GAP) * _UPPER
     bottom = top - high + (_GAP if i + 1 < panels // 2 else 0)
-    title = {"text": _stacked(channel.name, channel.unit)}
+    title = {"text": _two_line_title(channel.name, channel.unit)}
     upper = {"title": title, "domain": [middle, top]} | ({"range": limits} if limits else {})
     lower = {
-        "title": {"text": _stacked("residual", channel.unit)},
+        "title": {"text": _two_line_title("residual", channel.unit)},
         "domain": [max(bottom, 0), middle - _GAP / 2],
     }
     return {f"yaxis{2 * i + 1}" if i else "yaxis": upper, f"yaxis{2 * i + 2}": lower}
 
 
-def _stacked(name: str, unit: str) -> str:
+def _two_line_title(name: str, unit: str) -> str:
     """Return a title on two lines: the panels are too low on paper for name and unit on one."""
     return f"{name}<br>[{unit}]" if unit else name
 

@@ -56,9 +56,9 @@ class PageVerdict(NamedTuple):
 def fit_verdict(result: FitResult) -> PageVerdict:
     """Return the verdict of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
-    error, part = _worst(result.scores)
+    error, part = _worst_score(result.scores)
     bad = (
-        _warned(result, _RAN_AWAY)
+        _has_warning(result, _RAN_AWAY)
         or (error is not None and error > _POOR)
         or _code(result) == "hurts"
     )
@@ -72,8 +72,8 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     because = (
         f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
     )
-    first = next((f"{w.text.split(':')[0][0].upper()}{w.text.split(':')[0][1:]}. " for w in result.warnings
-                  if w.code == "one_step_only"), "")  # fmt: skip
+    causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
+    first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
     return PageVerdict(
         level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
     )
@@ -81,7 +81,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
     """Return the verdict of a comparison: which model to use."""
-    rows = [row for row in result.comparison if _worst(row.scores)[0] is not None]
+    rows = [row for row in result.comparison if _worst_score(row.scores)[0] is not None]
     if not rows:
         return PageVerdict(
             "bad",
@@ -89,10 +89,10 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
             "None of them can be used as it is.",
             "Look at the warnings below, and fit again.",
         )
-    errors = {row.name: _worst(row.scores)[0] or 0.0 for row in rows}
+    errors = {row.name: _worst_score(row.scores)[0] or 0.0 for row in rows}
     best = result.chosen or _best_model(rows, errors)
     row = next(row for row in result.comparison if row.name == best)
-    error, part = _worst(row.scores)
+    error, part = _worst_score(row.scores)
     doubts = list(_doubts(row, result.data))
     level = (
         "good"
@@ -106,11 +106,11 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     same = [name for name in near if percent(errors[name]) == percent(errors[best])]
     near = [name for name in near if name not in same]
     least = all(errors[best] <= other for name, other in errors.items() if name not in same)
-    less = f", as {'does' if len(same) == 1 else 'do'} {_quoted(same)}" if same else ""
+    less = f", as {'does' if len(same) == 1 else 'do'} {_quote_names(same)}" if same else ""
     less += (", and no other leaves less" if same else ", less than of any other") if least else ""
     how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
-    trust += f"; {_quoted(near)} {_is(near)} as good within 10 %." if near else "."
+    trust += f"; {_quote_names(near)} {_verb_for(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
     alone = errors.get("physics alone")
@@ -162,10 +162,10 @@ def _word(row: RowResult) -> str:
 
 
 def _error_text(error: float, part: str) -> str:
-    return f"{_on(part)} its free run leaves {percent(error)} of the output's deviation"
+    return f"{_place_of(part)} its free run leaves {percent(error)} of the output's deviation"
 
 
-def _on(part: str) -> str:
+def _place_of(part: str) -> str:
     return "on the training data" if part == "train" else f"on {part}"
 
 
@@ -182,7 +182,9 @@ def _worse(scores: dict[str, PartScores]) -> tuple[float, str] | None:
     return (found[part], part) if found and found[part] > _WORSE else None
 
 
-def _worst(scores: dict[str, PartScores], kind: str = "simulation") -> tuple[float | None, str]:
+def _worst_score(
+    scores: dict[str, PartScores], kind: str = "simulation"
+) -> tuple[float | None, str]:
     """Return the NRMSE of the free run on the held-out part where it is largest, RMS over outputs.
 
     On the training data where none is held out.
@@ -207,12 +209,12 @@ def _code(result: FitResult | RowResult) -> str | None:
     """
     return (
         None
-        if result.validation is None or _warned(result, "physics_alone")
+        if result.validation is None or _has_warning(result, "physics_alone")
         else result.validation.verdict
     )
 
 
-def _warned(result: FitResult | RowResult, code: str) -> bool:
+def _has_warning(result: FitResult | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
@@ -231,19 +233,19 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         yield "it was not tested on data that it was not fitted to"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
-    if _warned(result, "spectral_radius_above_one"):
+    if _has_warning(result, "spectral_radius_above_one"):
         yield (
             "it is not proved stable, for its local spectral radius is above 1 on a part of "
             "its free run"
         )
-    biased = [row.name for row in _rows(result) if _biased(row)]
+    biased = [row.name for row in _rows(result) if _is_biased(row)]
     if biased:
         one = len(biased) == 1
-        carry = _size_of_bias([row for row in _rows(result) if _biased(row)])
+        carry = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
         guessed = any(
             row.bias and (row.bias.share or 0.0) < SURE_SHARE
             for row in _rows(result)
-            if _biased(row)
+            if _is_biased(row)
         )
         carry = (
             f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
@@ -257,7 +259,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual is not noise alone",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
-    if _warned(result, "closed_loop"):
+    if _has_warning(result, "closed_loop"):
         yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
     if worse is not None:
@@ -306,22 +308,22 @@ def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
     return [*result.parameters, *(physical or [])]
 
 
-def _biased(row: ParameterResult) -> bool:
+def _is_biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
 def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
-    sure = [row.name for row in rows if _known(row)]
+    sure = [row.name for row in rows if _is_known(row)]
     known = sure if _noise_alone(result) else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
-    ahead, part = _worst(result.scores, "prediction")
+    ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
             "Use it only to look for what is missing: its one-step prediction, too, leaves "
-            f"{percent(ahead)} of the output's deviation {_on(part)}."
+            f"{percent(ahead)} of the output's deviation {_place_of(part)}."
         )
     if level == "bad" and not (known and predicts):
         return "Use it only to look for what is missing."
@@ -337,11 +339,13 @@ def _use_text(result: FitResult, level: str) -> str:
             "residual still holds"
         )
     text += (
-        f"; {_join(others)} {_is(others)} too uncertain or biased to be read so" if others else ""
+        f"; {_join(others)} {_verb_for(others)} too uncertain or biased to be read so"
+        if others
+        else ""
     )
     if shared:
         text += (
-            f"; {_join(shared)} {_is(shared)} taken from the physics nearest to the data, "
+            f"; {_join(shared)} {_verb_for(shared)} taken from the physics nearest to the data, "
             "for the learner could"
         )
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
@@ -356,17 +360,17 @@ def _noise_alone(result: FitResult) -> bool:
     )
 
 
-def _known(row: ParameterResult) -> bool:
+def _is_known(row: ParameterResult) -> bool:
     """Return whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
-    return sure and not row.shared and not _biased(row)
+    return sure and not row.shared and not _is_biased(row)
 
 
-def _quoted(names: list[str]) -> str:
+def _quote_names(names: list[str]) -> str:
     return _join([f"“{name}”" for name in names])
 
 
-def _is(names: list[str]) -> str:
+def _verb_for(names: list[str]) -> str:
     return "is" if len(names) == 1 else "are"
 
 
@@ -398,7 +402,7 @@ def _option(result: FitResult) -> str | None:
         return (
             'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
         )
-    predicted = None if result.advice_trials is not None else _predicted(result)
+    predicted = None if result.advice_trials is not None else _predicted_change(result)
     if predicted is not None:
         return predicted
     if not result.data.tests and not result.data.validation:
@@ -413,14 +417,14 @@ def _option(result: FitResult) -> str | None:
         return (
             f"training data that reach {entry.regressor} from {number(low, 3)} to {number(high, 3)}"
         )
-    if _warned(result, _RAN_AWAY):
+    if _has_warning(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
-    if _warned(result, "closed_loop"):
+    if _has_warning(result, "closed_loop"):
         return (
             "data with the reference recorded, to model the whole loop, with more of its "
             "motion, or in open loop"
         )
-    if _undecided(result):
+    if _is_undecided(result):
         return (
             "the learner (`training.fallback = false`), for cross-validation does not decide "
             "whether it helps"
@@ -444,9 +448,9 @@ def _option(result: FitResult) -> str | None:
     )
 
 
-def _predicted(result: FitResult) -> str | None:
+def _predicted_change(result: FitResult) -> str | None:
     """Return the change with the largest predicted gain, where none was tried."""
-    causes = [row.bias for row in _rows(result) if _biased(row) and row.bias]
+    causes = [row.bias for row in _rows(result) if _is_biased(row) and row.bias]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
     missing = (
         result.residuals.missing.terms if result.residuals and result.residuals.missing else []
@@ -473,11 +477,11 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
     return f"“{cause.cause}” in the physics, for {percent(cause.share)} of {what} {looks}"
 
 
-def _undecided(result: FitResult) -> bool:
+def _is_undecided(result: FitResult) -> bool:
     """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
     return (
-        _warned(result, "physics_alone")
+        _has_warning(result, "physics_alone")
         and ratio is not None
         and (ratio.value or 1.0) < 1 < (ratio.high or 0.0)
     )

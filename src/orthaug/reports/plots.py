@@ -28,7 +28,7 @@ from orthaug.reports.drawing import (
     outline,
     panels,
     plain,
-    ruled,
+    rule_axes,
     save,
     window,
 )
@@ -139,7 +139,7 @@ def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
     motion = model.form.motion
     rows = slice(0, min(len(states), 250))
     time = np.arange(rows.stop) * model.sampling_time
-    figure, axes = _stacked(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
+    figure, axes = _stack_panels(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
     for axis, state, values in zip(axes, motion.states, states.T, strict=True):
         axis.plot(time, values[rows], color=BLUE, linewidth=1.1)
         label(axis, y=with_unit(state.name, state.unit))
@@ -155,7 +155,7 @@ def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
     physics, learner = parts_at(model.form, model.numbers, states[rows], inputs[rows])
     names = labels_with_units(model)
     time = np.arange(rows.stop) * model.sampling_time
-    figure, axes = _stacked(2 * len(names), f"{title}: samples 0 to {rows.stop - 1}")
+    figure, axes = _stack_panels(2 * len(names), f"{title}: samples 0 to {rows.stop - 1}")
     for i, name in enumerate(names):
         axes[2 * i].plot(time, physics[:, i], color=BLUE, linewidth=1.1, label="physics")
         axes[2 * i + 1].plot(time, learner[:, i], color=GREEN, linewidth=1.1, label="learner")
@@ -262,7 +262,7 @@ def comparison_figure(rows: Sequence[RowResult]) -> Figure:
             )
         axis.set_ylabel(parameter_label(parameter))
     for axis in axes:
-        ruled(axis).margins(y=0.15)
+        rule_axes(axis).margins(y=0.15)
     axes[-1].set_xticks(place, names, rotation=15, ha="right")
     axes[-1].set_xlim(-0.5, len(rows) - 0.5)
     figure.align_ylabels()
@@ -378,7 +378,7 @@ def _floats(values: Sequence[float | None]) -> np.ndarray:
     return np.array(values, dtype=float)
 
 
-def _stacked(count: int, title: str) -> tuple[Figure, list]:
+def _stack_panels(count: int, title: str) -> tuple[Figure, list]:
     """Return panels below each other."""
     figure = Figure(figsize=(SIZE[0], TOP + 1.6 * count))
     axes = grid(figure, count, 1, sharex=True)[:, 0]

@@ -76,7 +76,7 @@ class ResidualTestResult(Content):
         return max((cross.band or 0.0 for cross in self.crossed.values()), default=0.0)
 
     @property
-    def most_telling(self) -> dict[str, RegressorResult]:
+    def strongest(self) -> dict[str, RegressorResult]:
         """Regressor on which the residual depends most clearly.
 
         It is the one of the most certain curvature, or that explains most where none has any.

@@ -328,12 +328,12 @@ class FitResult(ResultHeader):
 
     @property
     def noise_only(self) -> bool:
-        """Whether the intervals count noise only, although the residual shows more than that."""
+        """True if the intervals count noise only, although the residual shows more than that."""
         return any(row.ci95_counts for row in (*self.parameters, *(self.physical_parameters or ())))
 
     @property
     def learns(self) -> bool:
-        """Whether the biases are due to a learned part.
+        """True if the biases are due to a learned part.
 
         Without one, those of a motion are due to the residual of the free run.
         """

@@ -129,7 +129,7 @@ def selection_text(result: SelectResult) -> str:
         ]
         lines += [
             f"{t.term:<{width}}  {_percent(t.chosen):>6}  {_percent(t.left):>6}  "
-            f"{_small(t.rate)}  {_small(t.p)}  {_small(t.q)}"
+            f"{_p_text(t.rate)}  {_p_text(t.p)}  {_p_text(t.q)}"
             for t in result.terms
         ]
         lines += ["", *_EXPLAINED]
@@ -141,7 +141,7 @@ def selection_text(result: SelectResult) -> str:
     return "\n".join(fold(lines))
 
 
-def _small(p: float | None) -> str:
+def _p_text(p: float | None) -> str:
     return f"{'–' if p is None else f'{p:.2g}':>8}"
 
 

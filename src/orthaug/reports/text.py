@@ -238,7 +238,7 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
             else percent(abs(guess) * suspect.size)
         )
         biases = (
-            "–" if share is None else percent(_rounded(share) / 100, sign="+")
+            "–" if share is None else percent(_round_share(share) / 100, sign="+")
             for share in suspect.percent.values()
         )
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
@@ -272,15 +272,15 @@ def _bias_lines(result: FitResult) -> list[str]:
 
 def _bias_line(row: ParameterResult, width: int) -> str:
     value, bias, reach = row.value or 0.0, row.bias.value if row.bias else None, row.ci95_with_bias
-    bias = _rounded((bias or 0.0) / (value or 1.0)) * (value or 1.0)
+    bias = _round_share((bias or 0.0) / (value or 1.0)) * (value or 1.0)
     errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
-    part = f"{percent(_rounded(bias / value), sign='+') if value else '–':>9}"
+    part = f"{percent(_round_share(bias / value), sign='+') if value else '–':>9}"
     none = "–" if row.bias is None or row.bias.determined else "not determined by these data"
     limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{none:^29}"
     return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
 
 
-def _rounded(share: float) -> float:
+def _round_share(share: float) -> float:
     """Return a number, zero where it is only the rounding error of zero."""
     return 0.0 if abs(share) < 1e-9 else share
 
@@ -343,8 +343,9 @@ def _residual_lines(result: FitResult) -> list[str]:
             lag = 1 + int(np.argmax(np.abs(acf[1:])))
             largest = [(f"its own past by {acf[lag]:.2g} at lag {lag}", test.acf_band)]
             found = ((name, cross) for name, cross in test.cross.items() if cross is not None)
-            largest += [(f"{name} by {cross.values[len(acf) - 1 + cross.lag]:.2g} at lag {cross.lag}", cross.band)
-                        for name, cross in found]  # fmt: skip
+            for name, cross in found:
+                value = cross.values[len(acf) - 1 + cross.lag]
+                largest.append((f"{name} by {value:.2g} at lag {cross.lag}", cross.band))
             parts = ", ".join(f"{words} (band {band:.1g})" for words, band in largest)
             lines.append(
                 f"{part}: over all {test.n} rows the one-step residual of {test.name} follows "

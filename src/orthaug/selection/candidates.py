@@ -58,13 +58,13 @@ def candidates(problem: Problem, library: TermLibrary) -> Candidates:
         )
     kept = np.flatnonzero(own)
     if len(kept) > SHORTLIST:
-        kept = _promising(runs, known, kept)
+        kept = _promising_terms(runs, known, kept)
         text = (
             f"of {own.sum()} terms the {len(kept)} that promise most one step ahead were "
             "looked at on the free run."
         )
         notes.append(Warning("terms_shortlisted", text))
-    return Candidates(library.picked(kept), tuple(notes), int(own.sum()))
+    return Candidates(library.pick(kept), tuple(notes), int(own.sum()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def _chunks(
         begin += factors.shape[1]
 
 
-def _promising(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
+def _promising_terms(runs: TermRuns, known: _ModelColumns, among: np.ndarray) -> np.ndarray:
     """Return the most promising terms, in rounds: one look through all, then picks of the best."""
     found: dict[int, None] = {}
     for _ in range(_ROUNDS):
@@ -149,16 +149,16 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        text = f"terms that are not finite on these data were left out: {_named(infinite)}."
+        text = f"terms that are not finite on these data were left out: {_name_texts(infinite)}."
         notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        text = f"terms that the physics expresses already were left out: {_named(known)}."
+        text = f"terms that the physics expresses already were left out: {_name_texts(known)}."
         notes.append(Warning("terms_are_physics", text))
     return notes
 
 
-def _named(texts: list[str]) -> str:
+def _name_texts(texts: list[str]) -> str:
     return ", ".join(texts[:_NAMED]) + (
         f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
     )

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, written
+from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, suspect_text
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
 from orthaug.selection.learned_linearization import LearnedLinearization
 
@@ -49,12 +49,16 @@ class LearnerTarget:
     def of(cls, linearization: LearnedLinearization) -> LearnerTarget:
         """Return the target in the learner's tangent space over the points, where it has one."""
         q = basis_of(linearization.physics_moves.T)
-        raw = linearization.fitted(linearization.learner)
-        rest, size, tangent = without(raw, q), float(np.linalg.norm(raw)), linearization.tangent
+        raw = linearization.fitted_values(linearization.learner)
+        rest, size, tangent = (
+            project_out_basis(raw, q),
+            float(np.linalg.norm(raw)),
+            linearization.tangent,
+        )
         if tangent is None:
             return cls(linearization, q, None, rest, None, size)
         ridge: Any = np.broadcast_to(np.asarray(tangent.ridge, dtype=float), tangent.weights.shape)
-        u, sigma, vt = np.linalg.svd(without(tangent.jacobian, q), full_matrices=False)
+        u, sigma, vt = np.linalg.svd(project_out_basis(tangent.jacobian, q), full_matrices=False)
         kept = sigma > _RANK * sigma.max(initial=0.0)
         u, sigma, v = u[:, kept], sigma[kept], vt[kept].T
         # with U, Σ, V of J: S = U Σ (Σ² + VᵀλV)⁻¹ Σ Uᵀ
@@ -103,11 +107,11 @@ class LearnerTarget:
         if not np.isfinite(column).all():
             return np.full(len(self.target), np.nan)
         if self.view is None:
-            return without(self.linearization.fitted(column), self.q)
+            return project_out_basis(self.linearization.fitted_values(column), self.q)
         return self.view.T @ column
 
 
-def without(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:
+def project_out_basis(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np.ndarray:
     """Return values less the part that an orthonormal basis expresses, projected twice."""
     for _ in range(2 if basis.size else 0):
         values = values - basis @ (basis.T @ values)
@@ -175,7 +179,7 @@ class Candidate:
     def wide(self, width: float) -> Candidate:
         """Return the candidate with another width, of four digits."""
         width = float(f"{width:.4g}")
-        return replace(self, width=width, text=_written(self.kind, self.on, width))
+        return replace(self, width=width, text=_expression_text(self.kind, self.on, width))
 
     @property
     def name(self) -> str:
@@ -258,10 +262,12 @@ class Space:
             left = left - np.sum((self.columns @ basis) ** 2, axis=1)
         able = left > _OWN
         return np.where(
-            able, (self.columns @ without(self.target, basis)) ** 2 / np.where(able, left, 1.0), 0.0
+            able,
+            (self.columns @ project_out_basis(self.target, basis)) ** 2 / np.where(able, left, 1.0),
+            0.0,
         )
 
-    def explained(self, chosen: Sequence[Vector]) -> float:
+    def explained_share(self, chosen: Sequence[Vector]) -> float:
         """Return the share of the learner that chosen columns explain together."""
         return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
 
@@ -286,15 +292,15 @@ def candidates_of(
         (kind, on)
         for kind in _PLAIN
         for on in linearization.signals
-        if _likely(linearization, kind, on)
+        if _is_likely(linearization, kind, on)
     ]
-    known = {_written(kind, on) for kind, on in plain}
+    known = {_expression_text(kind, on) for kind, on in plain}
     texts = [text for text in library.texts if text != CONSTANT and text not in known]
     wide = [
         (kind, on)
         for kind in _WIDE
         for on in linearization.signals
-        if _likely(linearization, kind, on)
+        if _is_likely(linearization, kind, on)
     ]
     wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
     places = range(len(linearization.places))
@@ -307,16 +313,19 @@ def candidates_of(
         )
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
     for place in places:
-        found += [Candidate(kind, on, None, place, _written(kind, on)) for kind, on in plain]
+        found += [
+            Candidate(kind, on, None, place, _expression_text(kind, on)) for kind, on in plain
+        ]
         found += [Candidate(TERM, None, None, place, CONSTANT)]
         found += [Candidate(TERM, None, None, place, text) for text in texts]
         found += [
-            Candidate(kind, on, width, place, _written(kind, on, width)) for kind, on, width in wide
+            Candidate(kind, on, width, place, _expression_text(kind, on, width))
+            for kind, on, width in wide
         ]
     return tuple(found)
 
 
-def _likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
+def _is_likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
     """Return whether a kind suits a variable: friction needs both signs, a root a positive one."""
     if kind not in (*ODD_JUMPS, "square_root"):
         return True
@@ -338,10 +347,10 @@ def _grid(linearization: LearnedLinearization, on: str) -> Iterator[float]:
         yield from (float(f"{share * np.median(size[size > 0]):.4g}") for share in _WIDTHS)
 
 
-def _written(kind: str, on: str | None, width: float | None = None) -> str:
+def _expression_text(kind: str, on: str | None, width: float | None = None) -> str:
     if kind == "cubic" and on is not None and not outside_brackets(on, "+-*/ "):
         return f"{on}**3"
-    return written(kind, on, width, lambda text: text, "v")[0]
+    return suspect_text(kind, on, width, lambda text: text, "v")[0]
 
 
 def select(space: Space, most: int, least: float) -> list[Candidate]:
@@ -353,18 +362,18 @@ def select(space: Space, most: int, least: float) -> list[Candidate]:
     """
     chosen: list[Candidate] = []
     while len(chosen) < most and not space.empty:
-        grown = _grown(space, chosen)
+        grown = _grow(space, chosen)
         if not grown or _share(space, grown) < _share(space, chosen) + least:
             break
         chosen = grown
-    return _ordered(space, _pruned(space, chosen, least))
+    return _order(space, _prune(space, chosen, least))
 
 
 def _share(space: Space, chosen: Sequence[Candidate]) -> float:
-    return space.explained([space.column(one) for one in chosen])
+    return space.explained_share([space.column(one) for one in chosen])
 
 
-def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+def _grow(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     """Return one term more: beside all that are in, or a pair beside all but one.
 
     Widths refined, the simplest of the best.
@@ -378,7 +387,7 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
         others = chosen[:i] + chosen[i + 1 :]
         trials += [[*others, *pair] for pair in _best_pairs(space, others)]
     trials = [trial for trial in trials if len({one.form for one in trial}) == len(trial)]
-    trials = [_refined(space, trial, _ROUGH) for trial in trials]
+    trials = [_refine(space, trial, _ROUGH) for trial in trials]
     shares = [_share(space, trial) for trial in trials]
     best = max(shares, default=0.0)
     tie = max(space.tie, _PART * (1 - best))
@@ -386,7 +395,7 @@ def _grown(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     taken = min(
         able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None
     )
-    return [] if taken is None else _refined(space, trials[taken])
+    return [] if taken is None else _refine(space, trials[taken])
 
 
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
@@ -402,7 +411,7 @@ def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
 def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candidate, Candidate]]:
     """Return the pairs that explain most together beside others, of each two kinds the best."""
     basis = basis_of([space.column(one) for one in others])
-    x, y = space.columns, without(space.target, basis)
+    x, y = space.columns, project_out_basis(space.target, basis)
     if basis.size:
         x = x - (x @ basis) @ basis.T
     size, along = np.einsum("kr,kr->k", x, x), x @ y
@@ -433,49 +442,52 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
     return [(one, other) for _, one, other in ordered[:_TRIED]]
 
 
-def _refined(space: Space, chosen: list[Candidate], within: float = _FINE) -> list[Candidate]:
+def _refine(space: Space, chosen: list[Candidate], within: float = _FINE) -> list[Candidate]:
     for i, candidate in enumerate(chosen):
         if candidate.width is None:
             continue
         others = [space.column(one) for one in chosen[:i] + chosen[i + 1 :]]
 
-        def missed(
+        def unexplained_share(
             log: float, candidate: Candidate = candidate, others: list[Vector] = others
         ) -> float:
-            return -space.explained([*others, space.column(candidate.wide(float(np.exp(log))))])
+            return -space.explained_share(
+                [*others, space.column(candidate.wide(float(np.exp(log))))]
+            )
 
         centre = float(np.log(candidate.width))
         around = (centre - np.log(_REFINED), centre + np.log(_REFINED))
         options: Any = {"xatol": within}
         best = scipy.optimize.minimize_scalar(
-            missed, bounds=around, method="bounded", options=options
+            unexplained_share, bounds=around, method="bounded", options=options
         )
-        if best.fun < missed(centre) - 1e-6:
+        if best.fun < unexplained_share(centre) - 1e-6:
             chosen = [*chosen[:i], candidate.wide(float(np.exp(best.x))), *chosen[i + 1 :]]
     return chosen
 
 
-def _pruned(space: Space, chosen: list[Candidate], least: float) -> list[Candidate]:
+def _prune(space: Space, chosen: list[Candidate], least: float) -> list[Candidate]:
     """Return the chosen terms less those that the others make superfluous."""
     while len(chosen) > 1:
         columns = [space.column(one) for one in chosen]
-        whole = space.explained(columns)
+        whole = space.explained_share(columns)
         losses = [
-            whole - space.explained(columns[:i] + columns[i + 1 :]) for i in range(len(columns))
+            whole - space.explained_share(columns[:i] + columns[i + 1 :])
+            for i in range(len(columns))
         ]
         weakest = int(np.argmin(losses))
         if losses[weakest] >= least:
             break
-        chosen = _refined(space, chosen[:weakest] + chosen[weakest + 1 :])
+        chosen = _refine(space, chosen[:weakest] + chosen[weakest + 1 :])
     return chosen
 
 
-def _ordered(space: Space, chosen: list[Candidate]) -> list[Candidate]:
+def _order(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     """Return each next the one that explains most beside those before it."""
     left, order = list(chosen), []
     while left:
         known = [space.column(one) for one in order]
-        shares = [space.explained([*known, space.column(one)]) for one in left]
+        shares = [space.explained_share([*known, space.column(one)]) for one in left]
         order.append(left.pop(int(np.argmax(shares))))
     return order
 
@@ -514,13 +526,13 @@ def fit_terms(space: Space, chosen: Sequence[Candidate]) -> Fit:
     rest = linearization.learner - sum((b * c for b, c in zip(coefficients, raw, strict=True)), 0.0)
     covariance = None if shown.covariance is None else inverse @ shown.covariance @ inverse.T
     return Fit(
-        least_squares(linearization.physics_moves, linearization.fitted(rest)),
+        least_squares(linearization.physics_moves, linearization.fitted_values(rest)),
         coefficients,
         covariance,
     )
 
 
-def settled(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
+def settle_terms(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate], Fit, bool]:
     """Return the terms whose coefficients are significant against the learner's own errors.
 
     The last value is whether any other was dropped.
@@ -538,15 +550,15 @@ def rivals(
     """Return other terms that could replace one and explain nearly as much."""
     columns = [space.column(one) for one in chosen]
     others = columns[:number] + columns[number + 1 :]
-    gains = space.gains(others) + space.explained(others)
-    near = gains >= space.explained(columns) - 2 * space.tie
+    gains = space.gains(others) + space.explained_share(others)
+    near = gains >= space.explained_share(columns) - 2 * space.tie
     own = chosen[number]
     found = [space.candidates[int(i)] for i in np.argsort(-gains) if near[int(i)]]
     names = dict.fromkeys(one.name for one in found if one.identity != own.identity)
     return tuple(names)[:most]
 
 
-def alone(space: Space, most: int) -> list[tuple[Candidate, float]]:
+def single_terms(space: Space, most: int) -> list[tuple[Candidate, float]]:
     """Return the terms that explain most if each is the only one, the best width of each."""
     gains, found = space.gains([]), []
     for i in np.argsort(-gains, kind="stable"):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_count, check_type, is_number
-from orthaug._base.errors import InputError, Warning, shown
+from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.lines import percent
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.suspects import Suspect
@@ -29,11 +29,11 @@ from orthaug.selection.explaining import (
     Candidate,
     Fit,
     Space,
-    alone,
     candidates_of,
     rivals,
     select,
-    settled,
+    settle_terms,
+    single_terms,
 )
 from orthaug.selection.learned_linearization import LearnedLinearization, linearization_of
 
@@ -165,14 +165,16 @@ def added_to_motion(
             new.append(PhysicalParameter(width, float(one.width), one.width_unit or "", min=0))
             product = one.template.format(width=width)
         inside = _DIVIDED.fullmatch(text.strip())
-        if inside and _balanced(inside["inner"]) and inside["by"] in start:
+        if inside and _is_balanced(inside["inner"]) and inside["by"] in start:
             coefficient, unit = (
                 coefficient * start[inside["by"]],
                 _unit_inside(inside["inner"], one, units),
             )
         sign, factor = ("-", -1.0) if coefficient < 0 else ("+", 1.0)
-        summand = f" {sign} {one.name}" + ("" if product == "1" else f"*{_closed(product)}")
-        if inside and _balanced(inside["inner"]) and inside["by"] in start:
+        summand = f" {sign} {one.name}" + (
+            "" if product == "1" else f"*{_close_parentheses(product)}"
+        )
+        if inside and _is_balanced(inside["inner"]) and inside["by"] in start:
             texts[one.added_to] = f"({inside['inner']}{summand})/{inside['by']}"
         else:
             texts[one.added_to] = f"{text}{summand}"
@@ -217,7 +219,7 @@ def _unit_of_first(inner: str, units: dict[str, str]) -> str:
     return units.get(first[1], "") if first else ""
 
 
-def _closed(text: str) -> str:
+def _close_parentheses(text: str) -> str:
     depth = 0
     for i, character in enumerate(text):
         depth += (character in "([") - (character in ")]")
@@ -226,7 +228,7 @@ def _closed(text: str) -> str:
     return text
 
 
-def _balanced(text: str) -> bool:
+def _is_balanced(text: str) -> bool:
     depth = 0
     for character in text:
         depth += (character == "(") - (character == ")")
@@ -370,7 +372,7 @@ def explain(
         model = getattr(fit, "model", None)
         if not isinstance(model, Model | MotionModel):
             raise InputError(
-                f"`model` must be a model or what `estimate` returns; got {shown(fit)}."
+                f"`model` must be a model or what `estimate` returns; got {show(fit)}."
             )
         record = (
             getattr(getattr(fit, "problem", None), "record", None) if record is None else record
@@ -382,17 +384,19 @@ def explain(
         check_count(most, "most", of="terms"),
     )
     if not is_number(least) or not 0 < least < 1:
-        raise InputError(f"`least` must be a share between 0 and 1; got {shown(least)}.")
+        raise InputError(f"`least` must be a share between 0 and 1; got {show(least)}.")
     if isinstance(functions, str) or any(not isinstance(name, str) for name in functions):
         raise InputError(
-            f"`functions` must be a list of names, such as ['abs']; got {shown(functions)}."
+            f"`functions` must be a list of names, such as ['abs']; got {show(functions)}."
         )
     linearization = linearization_of(model, record)
     space = Space.of(
         linearization,
-        candidates_of(linearization, degree, functions, _declared(suspects, linearization)),
+        candidates_of(
+            linearization, degree, functions, _declared_expressions(suspects, linearization)
+        ),
     )
-    chosen, fitted, dropped = settled(space, select(space, most, least))
+    chosen, fitted, dropped = settle_terms(space, select(space, most, least))
     explanation = _explanation(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
@@ -406,7 +410,7 @@ def explain(
     return explanation
 
 
-def _declared(
+def _declared_expressions(
     suspects: Sequence[Any], linearization: LearnedLinearization
 ) -> list[tuple[str, int]]:
     """Return expressions of suspects with the number of their output or equation."""
@@ -435,9 +439,9 @@ def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bo
         noise = min(float(np.trace(space.shown.covariance)) / space.norm**2, 1.0)
     singles = tuple(
         SingleTerm(one.name, one.text, linearization.places[one.place][0], share)
-        for one, share in alone(space, _SHOWN)
+        for one, share in single_terms(space, _SHOWN)
     )
-    share = space.explained([space.column(one) for one in chosen])
+    share = space.explained_share([space.column(one) for one in chosen])
     real = p is None or p < _LEVEL
     if space.empty or not real or share < _HALF * (1 - (noise or 0.0)):
         chosen, text = [], _why_nothing(space, real, dropped, share, singles)
@@ -511,7 +515,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
     )
     for i, one in enumerate(chosen):
         place, unit = linearization.places[one.place]
-        whole = space.explained(columns[: i + 1])
+        whole = space.explained_share(columns[: i + 1])
         scale = _scale(one.kind, one.on, one.text)
         found.append(
             ExplainingTerm(
@@ -525,7 +529,7 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
                 unit=coefficient_unit(unit, linearization.parse(scale), linearization.units),
                 std=None if std is None else float(std[i]),
                 share=whole - before,
-                alone=space.explained([columns[i]]),
+                alone=space.explained_share([columns[i]]),
                 rivals=rivals(space, chosen, i),
             )
         )
@@ -547,7 +551,7 @@ def _physics(
 ) -> tuple[Baseline | Motion | None, str | None]:
     """Return the physics with the terms added, and the lines that say so in a spec."""
     several = len(linearization.places) > 1
-    added = [_added(linearization, term) for term in terms]
+    added = [_new_term(linearization, term) for term in terms]
     if isinstance(linearization.physics, Motion):
         changed = added_to_motion(linearization.physics, moved, added, linearization.units)
         return (None, None) if changed is None else (changed.motion, changed.lines())
@@ -555,7 +559,7 @@ def _physics(
     return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
 
 
-def _added(linearization: LearnedLinearization, term: ExplainingTerm) -> NewTerm:
+def _new_term(linearization: LearnedLinearization, term: ExplainingTerm) -> NewTerm:
     template = unit = None
     if term.width is not None:
         template = term.expression.replace(repr(term.width), "{width}")

@@ -1,4 +1,4 @@
-"""Which of the chosen terms are more than noise among so many candidates: the rate of false discoveries is controlled.
+"""Chosen terms that are more than noise: control of the rate of false discoveries.
 
 Of the t-values of m candidates the largest is large although none of them acts. So a term of a
 model of i terms stays only where its p-value is at most `q i / (m + 1 − i (1 − q))`, the
@@ -24,12 +24,12 @@ LEVEL = 0.05
 
 @dataclass(frozen=True)
 class Control:
-    """The rate of false discoveries that is allowed, and the number of candidates that the choice was made among."""
+    """The allowed rate of false discoveries, and the number of candidates of the choice."""
 
     level: float
     candidates: int
 
-    def allowed(self, size: int) -> float:
+    def largest_p(self, size: int) -> float:
         """Return the largest p-value of a term of a model of so many terms."""
         return self.level * size / (self.candidates + 1 - size * (1 - self.level))
 

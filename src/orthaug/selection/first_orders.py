@@ -52,7 +52,7 @@ def first_model(record: Record) -> FirstModel | None:
     better. Every model that is tried has a constant: without one, further lags make up
     for the level of the signals.
     """
-    record = _spread(record)
+    record = _spread_windows(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
     offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
     delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
@@ -91,7 +91,7 @@ def _smallest(
     return least, orders, errors
 
 
-def _spread(record: Record) -> Record:
+def _spread_windows(record: Record) -> Record:
     """Return the record, or windows that are spread over it where it is long."""
     if len(record) <= LOOKED_AT:
         return record

@@ -152,7 +152,7 @@ def _deviations(gram: Matrix, constant: int | None) -> Vector:
     return beside
 
 
-def spanned(
+def spanned_columns(
     equations: Equations, known: Sequence[int], within: float, constant: int | None
 ) -> list[int]:
     """Return the columns with less than `within` of their deviation outside the `known` ones."""

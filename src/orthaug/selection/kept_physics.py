@@ -14,7 +14,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug.selection.forward import Equations, spanned
+from orthaug.selection.forward import Equations, spanned_columns
 from orthaug.selection.term_runs import Able, Point, TermRuns
 
 MOVED, SPANNED = "physics_moved", "terms_within_span"
@@ -134,7 +134,7 @@ def kept_physics(
         )
         for i, p in enumerate(physics.parameters)
     )
-    within = spanned(every, columns, runs.collinear, runs.constant) if columns else []
+    within = spanned_columns(every, columns, runs.collinear, runs.constant) if columns else []
     terms = dict(zip((texts[i] for i in chosen.chosen), map(float, left[nt:]), strict=True))
     return PhysicsComparison(shifts, terms, condition, len(within), len(texts), runs.collinear)
 
@@ -142,7 +142,10 @@ def kept_physics(
 def standard_errors(
     runs: TermRuns, point: Point, own: Equations
 ) -> tuple[list[float | None], float]:
-    """Return standard errors of all columns of a model, None where the rows do not determine them, and the freedom."""
+    """Return standard errors of all columns of a model and the freedom.
+
+    A standard error is None where the rows do not determine it.
+    """
     size, inverse, values = _inverse(own)
     share = runs.independent_share(point)
     freedom = max(own.rows - len(size), 1)
@@ -154,7 +157,7 @@ def standard_errors(
 
 
 def _what_is_left(own: Equations) -> tuple[Vector, float]:
-    """Return the share of each column's norm that the others leave, and the condition number of all."""
+    """Return the share of each column's norm that the others leave, and the condition number."""
     _, inverse, values = _inverse(own)
     left = 1 / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     return left, float(np.sqrt(values[-1] / values[0])) if values[0] > _DETERMINED * values[
@@ -163,7 +166,7 @@ def _what_is_left(own: Equations) -> tuple[Vector, float]:
 
 
 def _inverse(own: Equations) -> tuple[Vector, Matrix, Vector]:
-    """Return the norms of the columns, and of their Gram matrix at norm 1 the inverse and the eigenvalues."""
+    """Return the norms of the columns, and inverse and eigenvalues of their Gram at norm 1."""
     size = np.sqrt(np.maximum(np.diag(own.hessian), 1e-300))
     gram: Matrix = own.hessian / np.outer(size, size)
     values = np.linalg.eigvalsh(gram) if len(gram) else np.ones(1)

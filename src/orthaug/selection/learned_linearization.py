@@ -87,7 +87,7 @@ class LearnedLinearization:
             )
         return (values[:, None] * self.weight[:, place]).ravel()
 
-    def fitted(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
+    def fitted_values(self, columns: Float[np.ndarray, "P *k"]) -> np.ndarray:
         """Return the effect of columns over the points on the fitted values (R, …)."""
         return columns if self.response is None else self.response.forward(columns)
 
@@ -148,7 +148,7 @@ def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
     c = model.theta - model.theta_aux
     return LearnedLinearization(
         target=target,
-        physics_moves=_stacked(np.einsum("oi,mit->mot", model.weight, phi)),
+        physics_moves=_stack(np.einsum("oi,mit->mot", model.weight, phi)),
         weight=np.asarray(model.weight),
         response=None,
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
@@ -163,7 +163,7 @@ def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
         values=model.theta,
         physics=form.baseline,
         tangent=_tangent(model, z, np.asarray(model.weight), None),
-        outside=_beyond(model, z),
+        outside=_share_beyond(model, z),
     )
 
 
@@ -194,12 +194,12 @@ def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
         units=units | {state.name: state.unit for state in motion.states} | {SAMPLING_TIME: "s"},
         parse=lambda text: parse_named(text, motion.known, "the term"),
         evaluate=lambda expression: expression.value(known, np),
-        moved=lambda along: _moved(motion, model.theta, along[:count], x, u),
+        moved=lambda along: _move_parameters(motion, model.theta, along[:count], x, u),
         parameters=coordinates.parameters,
         values=np.asarray(coordinates.physical(model.theta)),
         physics=motion,
         tangent=_tangent(model, z, np.eye(len(learned)), response),
-        outside=_beyond(model, z),
+        outside=_share_beyond(model, z),
     )
 
 
@@ -289,7 +289,7 @@ def _derivatives(
     form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
 ) -> tuple[Any, Any]:
     """Return ∂(next state)/∂x and ∂y/∂x at points."""
-    numbers = form.prepared(numbers)
+    numbers = form.prepare(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
     return steps, jax.vmap(lambda x, u: jax.jacfwd(lambda s: form.observed(numbers, s, u))(x))(x, u)
 
@@ -313,7 +313,7 @@ class Response:
 
     def adjoint(self, values: Float[np.ndarray, "R k"]) -> Float[np.ndarray, "P k"]:
         """Return the transpose."""
-        return _stacked(self.linear.adjoint(values)[:, list(self.learned)])
+        return _stack(self.linear.adjoint(values)[:, list(self.learned)])
 
 
 class _Run(NamedTuple):
@@ -346,7 +346,7 @@ class _Run(NamedTuple):
         return cls(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
 
 
-def _stacked(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
+def _stack(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
     """Return all points and places below each other."""
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
@@ -362,7 +362,7 @@ def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
     return tuple(zip(names, units, strict=True))
 
 
-def _moved(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
+def _move_parameters(motion: Motion, q: Vector, along: Vector, x: Matrix, u: Matrix) -> Vector:
     """Return the parameters after a step of their coordinates q (np,), along a straight line.
 
     A step of logarithms where that would end at a zero that the equations divide by.
@@ -386,7 +386,7 @@ def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
     return found
 
 
-def _beyond(model: Any, z: Matrix) -> float:
+def _share_beyond(model: Any, z: Matrix) -> float:
     """Return the share of the points with a feature outside its training range."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0

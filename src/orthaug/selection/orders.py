@@ -142,7 +142,7 @@ def search_orders(
     with one_blas_thread():
         folds = Blocks(runs, blocks, runner)
 
-        def chosen(orders: Orders, level: list[int] = level) -> list[int]:
+        def choose_orders(orders: Orders, level: list[int] = level) -> list[int]:
             numbers = [place[output, i] for i in range(1, orders.na + 1)]
             for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
                 numbers += [place[name, i] for i in range(nk, nk + nb)]
@@ -151,7 +151,7 @@ def search_orders(
         def judge(several: Iterable[Orders]) -> None:
             new = [orders for orders in dict.fromkeys(several) if orders not in found]
             for orders, (point, held, seconds) in zip(
-                new, folds.fitted(list(map(chosen, new))), strict=True
+                new, folds.fit_each(list(map(choose_orders, new))), strict=True
             ):
                 found[orders] = PathModel(point, (str(orders),), held, seconds, orders.size)
                 report(found[orders])
@@ -173,7 +173,7 @@ def search_orders(
         search = OrderSearch(tuple(found.values()), tuple(found))
         if not level:
             return search
-        point, held, seconds = next(folds.fitted([chosen(search.chosen, [])]))
+        point, held, seconds = next(folds.fit_each([choose_orders(search.chosen, [])]))
         without = PathModel(point, (), held, seconds, search.chosen.size)
         needed = not judge_all(
             (without, replace(search.rungs[search.place], size=without.size + 1))

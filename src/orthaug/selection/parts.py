@@ -1,4 +1,6 @@
-"""Rows that choose and rows that are fitted: intervals hold after a choice that was made on other rows (Cox 1975).
+"""Rows that choose and rows that are fitted.
+
+Intervals hold after a choice that was made on other rows (Cox 1975).
 
 Terms that one half of the data picked are fitted to the other: it had no say in the choice, so
 estimates, intervals and p-values there are as if the terms had been declared. The half that is
@@ -25,7 +27,7 @@ SPLIT, NONE = "split sample", "none"
 
 @dataclass(frozen=True)
 class Intervals:
-    """Where the intervals of a fit of the choice come from, in a word and in a sentence.
+    """Source of the intervals of a fit of the choice, in a word and in a sentence.
 
     `source` is "split sample", from rows that had no say in the choice; "none", for there are none;
     "declared", where nothing was chosen beside the physics; or "conditional", of a network that was
@@ -36,7 +38,7 @@ class Intervals:
     text: str
 
     @classmethod
-    def none(cls, why: str) -> Intervals:
+    def empty(cls, why: str) -> Intervals:
         """Return that there are none, and why."""
         return cls(
             NONE,
@@ -66,17 +68,22 @@ class Parts:
     intervals: Intervals
 
 
-def parted(
+def split_record(
     record: Record, baseline: Baseline, lags: int, *, by: str | None = None, least: int = FEWEST
 ) -> Parts:
     """Cut a record into the part that chooses and the one that is fitted.
 
-    Args: lags: leading rows of an experiment that are lags. by: "rows" cuts every experiment in
-        two, "experiments" leaves each whole; None takes what parts the rows evenly. least: usable
-        rows of each part.
+    Args:
+        record: the data.
+        baseline: the physics.
+        lags: leading rows of an experiment that are lags.
+        by: "rows" cuts every experiment in two, "experiments" leaves each whole; None takes what
+            parts the rows evenly.
+        least: usable rows of each part.
 
-    Raises: InputError: a part that is too short, or does not excite the physics; the message says
-        which.
+    Raises:
+        InputError: a part that is too short, or does not excite the physics; the message says
+            which.
     """
     first, second = _cut(record, lags, by)
     fewest = min(_usable(part, lags) for part in (first, second))

@@ -1,4 +1,4 @@
-"""For which other candidate a chosen term may stand in: beside that, it is not significant.
+"""Rivals of a chosen term: candidates beside which it is not significant.
 
 The products of lagged signals are like each other. Where the wrong one of two is chosen its
 coefficient is not zero: it is the best in the model without the other, and its interval holds that.
@@ -20,7 +20,7 @@ _LISTED = 3
 
 
 def rivals(runs: TermRuns, point: Point) -> dict[str, tuple[str, ...]]:
-    """Return of each term that is significant at 5 % the candidates beside which it is not, the best first."""
+    """Return, best first, the candidates beside which a term significant at 5 % is not so."""
     nt, texts = len(point.c), runs.library.texts
     equations = runs.equations(point)
     known = [*range(nt), *(nt + i for i in point.chosen)]
@@ -40,7 +40,7 @@ def rivals(runs: TermRuns, point: Point) -> dict[str, tuple[str, ...]]:
         if std is None or abs(point.w[place]) < reach(freedom) * std:
             continue
         others = [column for column in known if column != nt + i]
-        gram, left = _beside(hessian, right, others)
+        gram, left = _project_out(hessian, right, others)
         gains, kept = _gains_with_each(gram, left, nt + i)
         able = [k for k in np.flatnonzero(kept < least) if k not in known]
         able.sort(key=lambda k: -gains[k])
@@ -49,7 +49,7 @@ def rivals(runs: TermRuns, point: Point) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _beside(hessian: Matrix, right: Vector, known: list[int]) -> tuple[Matrix, Vector]:
+def _project_out(hessian: Matrix, right: Vector, known: list[int]) -> tuple[Matrix, Vector]:
     """Return the equations with some columns projected out."""
     across = hessian[:, known] @ np.linalg.pinv(
         hessian[np.ix_(known, known)], rcond=1e-12, hermitian=True
@@ -58,7 +58,7 @@ def _beside(hessian: Matrix, right: Vector, known: list[int]) -> tuple[Matrix, V
 
 
 def _gains_with_each(gram: Matrix, right: Vector, column: int) -> tuple[Vector, Vector]:
-    """Return what each column lowers the squared error by, and what a given one lowers it by beside each."""
+    """Return the fall of the squared error by each column, and by a given one beside each."""
     size = np.diag(gram)
     able = size > DEPENDENT  # of columns of norm 1
     safe = np.where(able, size, 1.0)

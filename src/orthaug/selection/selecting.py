@@ -22,7 +22,7 @@ from orthaug.data.regressors import Lags, in_order
 from orthaug.data.terms import CONSTANT
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.held_out import blocked, mean_square, squared_errors
+from orthaug.fitting.held_out import held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.learners import MLP, Learner
 from orthaug.models.rows import Engine, InMemory
@@ -44,7 +44,7 @@ from orthaug.selection.parts import (
     Intervals,
     Parts,
     of_parts,
-    parted,
+    split_record,
 )
 from orthaug.selection.rivals import rivals
 from orthaug.selection.term_path import (
@@ -102,7 +102,7 @@ def search_learners(
     tried += [
         replace(learner, hidden=(width,), inputs=inputs) for inputs in seen for width in widths
     ]
-    folds = blocked(record, blocks, max(problem.first_row, _largest(lags)))
+    folds = held_out_blocks(record, blocks, max(problem.first_row, _largest_order(lags)))
     names = (
         tuple(channel.name for channel in record.outputs),
         tuple(channel.name for channel in record.inputs),
@@ -132,7 +132,7 @@ def search_learners(
     return LearnerSearch(tuple(rungs), tuple(tried[: len(rungs)]))
 
 
-def _largest(lags: Lags) -> int:
+def _largest_order(lags: Lags) -> int:
     nb, nk = (np.atleast_1d(part) for part in (lags.nb, lags.nk))
     return int(max(np.max(lags.na, initial=0), np.max(nb + nk - 1, initial=0)))
 
@@ -172,7 +172,7 @@ WIDTHS = (4, 8, 16)
 _RIVALS = (
     "may stand in: {}. Beside the other, the chosen term is not significant on the rows that "
     "are fitted. Its coefficient and interval are those of a model without the other; more "
-    "varied inputs tell them apart."
+    "varied inputs distinguish them."
 )
 _NOT_CONFIRMED = (
     "not confirmed on the rows that had no say in the choice: {}. The q-value there is above "
@@ -228,7 +228,7 @@ class Selection:
     """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None
     for no such.
     """
-    intervals: Intervals = Intervals.none("all rows chose")
+    intervals: Intervals = Intervals.empty("all rows chose")
     """Where intervals of a fit of the choice come from."""
     level: float = LEVEL
     """The rate of false discoveries that was allowed."""
@@ -247,12 +247,12 @@ class Selection:
         if self.terms is not None:
             chosen, texts = self.terms.chosen.point.chosen, self.terms.runs.library.texts
             return Terms(tuple(texts[i] for i in chosen)) if chosen else None
-        linear = _beside(self.orders, self.record, self.baseline)
+        linear = _linear_texts(self.orders, self.record, self.baseline)
         return Terms(tuple(linear)) if linear else None
 
     @cached_property
     def shares(self) -> dict[str, float]:
-        """Of every chosen term, how often it is chosen over random halves of the rows that chose.
+        """Share of random halves of the rows that chose in which each chosen term is chosen.
 
         Empty where no terms were chosen from a library; linear lags are chosen as orders, and a
         network as a whole.
@@ -301,10 +301,9 @@ class Selection:
 
     @cached_property
     def rivals(self) -> dict[str, tuple[str, ...]]:
-        """Of a chosen term the candidates for which it may stand in, on the rows that `estimate` fits.
+        """Rivals of each chosen term on the rows that `estimate` fits.
 
-        Beside one of these the term is not significant, so these rows do not tell which of the two
-        acts.
+        Beside a rival the term is not significant, so these rows do not show which of the two acts.
         """
         if self.terms is None or not isinstance(self.learner, Terms):
             return {}
@@ -355,11 +354,11 @@ class Selection:
         return pd.DataFrame(rows)
 
     def _stages(self) -> list[tuple[str, Sequence[RankedModel]]]:
-        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judged())]
+        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judge())]
         if self.terms is not None:
-            stages.append(("terms", self.terms.judged()))
+            stages.append(("terms", self.terms.judge()))
         if self.learners is not None:
-            stages.append(("learner", self.learners.judged()))
+            stages.append(("learner", self.learners.judge()))
         return stages
 
     def summary(self) -> str:
@@ -478,7 +477,7 @@ def select(
     layout = partial(_layout, problem.outputs, names)
     asked = _with_every_input(orders.chosen, largest)
     tested = nonlinearity(problem, [str(lag) for lag in layout(asked)]) if layout(asked) else None
-    reach = _reached(orders.chosen, asked, tested, names)
+    reach = _orders_with_inputs(orders.chosen, asked, tested, names)
     search = _Search(problem, criterion, largest, blocks, collinear, level, heard, runner)
     path, found, physics, notes = search.beyond(learner, orders, reach, tested, widths, most)
     if heard.stopped:
@@ -500,12 +499,12 @@ def select(
         heard.stopped,
     )
     selection = Selection(*chosen, physics, reach, parts.intervals, level)
-    return _noted(selection, whole if fitted is None else fitted)
+    return _add_notes(selection, whole if fitted is None else fitted)
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """What the rows that choose are searched with, beyond linear lags."""
+    """Settings of the search on the rows that choose, beyond linear lags."""
 
     problem: Problem
     criterion: Criterion
@@ -531,16 +530,16 @@ class _Search:
         """
         problem, criterion, lags = self.problem, self.criterion, Lags(reach.na, reach.nb, reach.nk)
         if isinstance(learner, MLP) and not self.heard.stopped:
-            told = self.heard.of("learner")
-            beside = (learner, widths, criterion, self.blocks, told, self.runner)
-            return None, search_learners(problem, lags, tested, *beside), None, []
+            listener = self.heard.of("learner")
+            settings = (learner, widths, criterion, self.blocks, listener, self.runner)
+            return None, search_learners(problem, lags, tested, *settings), None, []
         if not isinstance(learner, Terms) or self.heard.stopped:
             return None, None, None, []
         baseline, names = problem.baseline, [channel.name for channel in problem.record.inputs]
         runs, notes, considered = _terms(problem, learner, self.largest, criterion, self.collinear)
         near = [baseline.lags, _layout(problem.outputs, names, reach)]
         linear, at_most = (
-            _beside(orders, problem.record, baseline),
+            _linear_texts(orders, problem.record, baseline),
             min(most, len(problem.rows) // 10),
         )
         control = Control(self.level, considered) if self.level < 1 else None
@@ -570,7 +569,7 @@ def _parts(
     network: bool,
 ) -> Parts:
     """Return the rows that choose and those that are fitted."""
-    lags = _lagged(largest)
+    lags = _lag_count(largest)
     if isinstance(halves, Parts):
         return halves
     if fitted is not None:
@@ -578,29 +577,29 @@ def _parts(
             record, fitted, of_parts(sum(max(len(e) - lags, 0) for e in fitted.experiments))
         )
     if halves:
-        return parted(record, baseline, lags, least=1)
+        return split_record(record, baseline, lags, least=1)
     if network:
         return Parts(record, record, CONDITIONAL)
     if halves is not None:
-        return Parts(record, record, Intervals.none("`halves` is false"))
+        return Parts(record, record, Intervals.empty("`halves` is false"))
     try:
-        return parted(record, baseline, lags)
+        return split_record(record, baseline, lags)
     except InputError as error:
-        return Parts(record, record, Intervals.none(str(error)))
+        return Parts(record, record, Intervals.empty(str(error)))
 
 
 def lagged_rows(problem: Problem, lags: Lags | None) -> int:
-    """Return how many leading rows of an experiment are lags of the largest orders that are looked at."""
-    return _lagged(_reach(problem, lags)[0])
+    """Return the number of leading rows of an experiment that are lags, for the largest orders."""
+    return _lag_count(_reach(problem, lags)[0])
 
 
-def _lagged(largest: Orders) -> int:
+def _lag_count(largest: Orders) -> int:
     return max(
         [largest.na, *(nk + nb - 1 for nk, nb in zip(largest.nk, largest.nb, strict=True) if nb)]
     )
 
 
-def _noted(found: Selection, declared: Record) -> Selection:
+def _add_notes(found: Selection, declared: Record) -> Selection:
     """Return the selection with what is to be said of its intervals.
 
     Of all rows where nothing was chosen.
@@ -653,7 +652,7 @@ def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tu
     return Lags(orders.na, orders.nb, orders.nk).layout(outputs, inputs)
 
 
-def _beside(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
+def _linear_texts(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
     """Return the linear lags of the choice, and its constant, that the physics does not have."""
     outputs, inputs = (
         [channel.name for channel in group] for group in (record.outputs, record.inputs)
@@ -676,7 +675,7 @@ def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
     return replace(chosen, nb=nb, nk=nk)
 
 
-def _reached(
+def _orders_with_inputs(
     chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
 ) -> Orders:
     """Return the chosen orders with the inputs that have only a nonlinear effect."""
@@ -698,7 +697,7 @@ def _reached(
 def _terms(
     problem: Problem, learner: Terms, largest: Orders, criterion: Criterion, collinear: float
 ) -> tuple[TermRuns, list[Warning], int]:
-    """Return the library of terms laid out, what is to be told of it, and how many terms could be chosen."""
+    """Return the runs of the library of terms, notes, and the number of candidates."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
     lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]

@@ -23,7 +23,7 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.data.expressions import Lag
-from orthaug.fitting.held_out import WORTH, blocked
+from orthaug.fitting.held_out import WORTH, held_out_blocks
 from orthaug.fitting.segments import Segments, build_segments
 from orthaug.selection.false_discoveries import Control, p_values
 from orthaug.selection.forward import Equations, forward
@@ -125,14 +125,14 @@ class Search:
 
     rungs: tuple[PathModel, ...]
 
-    def judged(self) -> tuple[RankedModel, ...]:
+    def judge(self) -> tuple[RankedModel, ...]:
         """Return every model beside the best."""
         return judge_all(self.rungs)
 
     @property
     def place(self) -> int:
         """The number of the choice."""
-        return next(i for i, one in enumerate(self.judged()) if one.chosen)
+        return next(i for i, one in enumerate(self.judge()) if one.chosen)
 
 
 class Blocks:
@@ -143,7 +143,7 @@ class Blocks:
         self.runner = runner
         self.folds: list[tuple[TermRuns, Segments]] = []
         held_shape: Segments | None = None
-        for kept, held in blocked(runs.problem.record, blocks, first):
+        for kept, held in held_out_blocks(runs.problem.record, blocks, first):
             layout = build_segments(held, runs.menu, 0, runs.free_run.washout, held_shape)
             held_shape = layout if held_shape is None else held_shape
             self.folds.append((runs.on(kept), layout))
@@ -157,7 +157,7 @@ class Blocks:
         The mean squared errors on the blocks come with it.
         """
         items = [(i, point, count, able) for i, point in enumerate(points)]
-        points, errors = zip(*self.runner.map(_along, self.given, items), strict=True)
+        points, errors = zip(*self.runner.map(_path_without, self.given, items), strict=True)
         return list(points), np.array(errors)
 
     def judge(self, points: Sequence[Point]) -> Iterator[tuple[Vector, float]]:
@@ -173,7 +173,7 @@ class Blocks:
             errors, seconds = zip(*islice(found, len(self.folds)), strict=True)
             yield np.array(errors), sum(seconds)
 
-    def fitted(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
+    def fit_each(self, choices: Sequence[Sequence[int]]) -> Iterator[tuple[Point, Vector, float]]:
         """Yield each choice fitted to all of the record and judged; and what it took [s]."""
         points = list(self.runner.map(_on_all, self.given, choices))
         judged = self.judge([point for point, _ in points])
@@ -223,7 +223,7 @@ def _on_fold(
     ), time.monotonic() - began
 
 
-def _along(
+def _path_without(
     given: _Given, item: tuple[int, Point | None, int, Able], report: Callable[..., None]
 ) -> tuple[Point, float]:
     """Return physics alone, or some terms more, picked without a block.
@@ -235,7 +235,7 @@ def _along(
     if point is None:
         point = runs.fit(runs.start(), ())
     elif np.isfinite(point.loss):
-        point = _grown(runs, point, count, able)
+        point = _grow(runs, point, count, able)
     return point, runs.errors(point, held) if np.isfinite(point.loss) else np.inf
 
 
@@ -248,7 +248,7 @@ class TermPath(Search):
     ways: tuple[tuple[int, ...], ...] = ()
     """Terms that ways forward kept to, before the one that had all."""
     control: Control | None = None
-    """What a term must stand beside so many candidates; None for no such rule."""
+    """The rule for a term among so many candidates; None for no such rule."""
     kept: int | None = None
     """The model that the rule left, where it took terms away; None where it took none."""
 
@@ -258,14 +258,14 @@ class TermPath(Search):
         chosen = set(self.chosen.point.chosen)
         return next((able for able in self.ways if chosen <= set(able)), None)
 
-    def judged(self) -> tuple[RankedModel, ...]:
+    def judge(self) -> tuple[RankedModel, ...]:
         found = judge_all(self.rungs, self.confirmed)
         if self.kept is None:
             return found
         return tuple(replace(one, chosen=i == self.kept) for i, one in enumerate(found))
 
     def rates(self) -> dict[str, float]:
-        """Of every term of the choice, the least rate of false discoveries at which it would have stayed."""
+        """Return the least rate of false discoveries at which each chosen term would remain."""
         point, texts = self.chosen.point, self.runs.library.texts
         control = self.control or Control(1.0, len(texts))
         found = control.rates(p_values(self.runs, point)) if point.chosen else ()
@@ -290,7 +290,7 @@ class TermPath(Search):
         rng, count = np.random.default_rng(_SEED), np.zeros(len(runs.library))
         for _ in range(_HALVES):
             half = rng.permutation(len(parts))[: len(parts) // 2]
-            picks = _picked(runs, Equations.sum_of(parts[i] for i in half), (), most)
+            picks = _pick(runs, Equations.sum_of(parts[i] for i in half), (), most)
             count[picks] += 1
         texts = runs.library.texts
         return {texts[i]: float(count[i] / _HALVES) for i in rung.point.chosen}
@@ -322,7 +322,7 @@ def climb(
         folds, rungs, ways = Blocks(runs, blocks, runner), [], _ways(runs, near)
         confirmed, kept = True, None
 
-        def judged(point: Point, change: Sequence[str], began: float) -> PathModel:
+        def judge_model(point: Point, change: Sequence[str], began: float) -> PathModel:
             known = (
                 rung.held for rung in rungs if rung.point.chosen == point.chosen
             )  # ways that begin alike
@@ -342,8 +342,8 @@ def climb(
 
         try:
             began = time.monotonic()
-            alone = judged(runs.fit(runs.start(), ()), (), began)
-            given = _given(runs, alone.point, linear[:most])
+            alone = judge_model(runs.fit(runs.start(), ()), (), began)
+            given = _named_candidates(runs, alone.point, linear[:most])
             for able in (*ways, None):
                 begin = alone
                 if (
@@ -353,16 +353,16 @@ def climb(
                 ):
                     began, given_now, given = time.monotonic(), given, ()
                     point = runs.fit(alone.point, given_now)
-                    begin = judged(
+                    begin = judge_model(
                         point,
                         ["physics alone", *(f"+ {runs.library.texts[i]}" for i in given_now)],
                         began,
                     )
-                _forward(runs, begin, most, able, judged, again=len(rungs) > 1)
-            _anew(path, judged)
-            confirmed = _confirmed(folds, path().chosen.size, path().way)
-            _backward(path(), judged)
-            kept = _controlled(path(), judged)
+                _forward(runs, begin, most, able, judge_model, again=len(rungs) > 1)
+            _judge_again(path, judge_model)
+            confirmed = _is_confirmed(folds, path().chosen.size, path().way)
+            _backward(path(), judge_model)
+            kept = _apply_control(path(), judge_model)
         except KeyboardInterrupt:
             if not rungs:
                 raise
@@ -379,11 +379,11 @@ def _ways(runs: TermRuns, near: Sequence[Collection[Lag]]) -> tuple[tuple[int, .
     return tuple(able for able in dict.fromkeys(own) if 0 < len(able) < len(runs.library))
 
 
-def _given(runs: TermRuns, alone: Point, linear: Sequence[str]) -> tuple[int, ...]:
+def _named_candidates(runs: TermRuns, alone: Point, linear: Sequence[str]) -> tuple[int, ...]:
     """Return the named candidates, by number, outside the span of physics and one another."""
     texts = {text: i for i, text in enumerate(runs.library.texts)}
     numbers = [texts[text] for text in linear if text in texts]
-    return tuple(_picked(runs, runs.equations(alone, numbers), (), len(numbers))) if numbers else ()
+    return tuple(_pick(runs, runs.equations(alone, numbers), (), len(numbers))) if numbers else ()
 
 
 def steps(most: int) -> int:
@@ -409,7 +409,7 @@ def _forward(
     while len(point.chosen) < most and waited < _PATIENCE and np.isfinite(point.loss):
         began = time.monotonic()
         count = min(_added_to(len(point.chosen)), most - len(point.chosen))
-        before, point = point, _grown(runs, point, count, able)
+        before, point = point, _grow(runs, point, count, able)
         new = point.chosen[len(before.chosen) :]
         if not new or not point.loss < before.loss:
             break
@@ -419,13 +419,13 @@ def _forward(
         best = min(best, rung.score)
 
 
-def _grown(runs: TermRuns, point: Point, count: int, able: Able) -> Point:
+def _grow(runs: TermRuns, point: Point, count: int, able: Able) -> Point:
     """Return the point with the terms that lower the error most; the point itself without any."""
-    new = _picked(runs, runs.equations(point, able), point.chosen, count, least=_LEAST)
+    new = _pick(runs, runs.equations(point, able), point.chosen, count, least=_LEAST)
     return runs.fit(point, (*point.chosen, *new)) if new else point
 
 
-def _picked(
+def _pick(
     runs: TermRuns, equations: Equations, chosen: Sequence[int], count: int, *, least: float = 0.0
 ) -> list[int]:
     """Return up to `count` further terms by number, each outside the span of those before it."""
@@ -437,7 +437,7 @@ def _picked(
     return [pick.column - nt for pick in picks]
 
 
-def _anew(path: Callable[[], TermPath], judged: Any) -> None:
+def _judge_again(path: Callable[[], TermPath], judged: Any) -> None:
     """Judge as many terms, picked anew at once about the chosen model.
 
     There the free run bends otherwise than about physics alone.
@@ -448,23 +448,23 @@ def _anew(path: Callable[[], TermPath], judged: Any) -> None:
             return
         texts, before = runs.library.texts, set(rung.point.chosen)
         equations = runs.equations(rung.point, path().way)
-        new = tuple(_picked(runs, equations, (), rung.size))
+        new = tuple(_pick(runs, equations, (), rung.size))
         if any({*new} == set(other.point.chosen) for other in path().rungs):
             return
         change = [f"+ {texts[i]}" for i in new if i not in before] + [
             f"− {texts[i]}" for i in sorted(before - {*new})
         ]
-        judged(_refitted(runs, rung.point, equations, new), change, began)
+        judged(_refit(runs, rung.point, equations, new), change, began)
 
 
-def _refitted(runs: TermRuns, point: Point, equations: Equations, chosen: tuple[int, ...]) -> Point:
+def _refit(runs: TermRuns, point: Point, equations: Equations, chosen: tuple[int, ...]) -> Point:
     """Return the point with other terms, fitted from where its equations have them."""
     nt = len(point.c)
     p = equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
     return runs.fit(point._replace(chosen=chosen, c=p[:nt], w=p[nt:]), chosen)
 
 
-def _confirmed(folds: Blocks, size: int, able: Able) -> bool:
+def _is_confirmed(folds: Blocks, size: int, able: Able) -> bool:
     """Return whether up to `size` terms beat physics alone on blocks not used to pick them."""
     points: Sequence[Point | None] = [None] * len(folds.folds)
     rungs: list[PathModel] = []
@@ -499,13 +499,13 @@ def _backward(path: TermPath, judged: Any) -> None:
         missed = (inverse @ own.right)[nt:] ** 2 / np.maximum(np.diag(inverse)[nt:], 1e-300)
         gone = point.chosen[int(np.argmin(missed))]
         left = tuple(i for i in point.chosen if i != gone)
-        point = _refitted(runs, point, equations, left)  # the others take over what it did
+        point = _refit(runs, point, equations, left)  # the others take over what it did
         rung = judged(point, [f"− {texts[gone]}"], began)
         path = replace(path, rungs=(*path.rungs, rung))
 
 
-def _controlled(path: TermPath, judged: Any) -> int | None:
-    """Return the number of the model whose terms all stand the control.
+def _apply_control(path: TermPath, judged: Any) -> int | None:
+    """Return the number of the model whose terms all pass the control.
 
     None where those of the choice do.
     """
@@ -514,7 +514,7 @@ def _controlled(path: TermPath, judged: Any) -> int | None:
     while control is not None and rung.size:
         began, point = time.monotonic(), rung.point
         p = p_values(runs, point)
-        if p.max() <= control.allowed(rung.size):
+        if p.max() <= control.largest_p(rung.size):
             break
         gone = point.chosen[int(np.argmax(p))]
         left = tuple(i for i in point.chosen if i != gone)
@@ -522,7 +522,7 @@ def _controlled(path: TermPath, judged: Any) -> int | None:
             (i for i, other in enumerate(rungs) if set(other.point.chosen) == set(left)), None
         )
         if place is None:
-            fitted = _refitted(runs, point, runs.equations(point, ()), left)
+            fitted = _refit(runs, point, runs.equations(point, ()), left)
             rungs.append(judged(fitted, [f"− {runs.library.texts[gone]}"], began))
             place = len(rungs) - 1
         rung = rungs[place]

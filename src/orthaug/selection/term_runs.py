@@ -269,7 +269,7 @@ class TermRuns:
             [point.c, w, np.zeros(objective.dynamics.unknowns - len(point.c) - len(w))]
         )
         states = point.states if point.states is not None else np.asarray(self.layout.start)
-        trial = _descended(objective, p, Start(states), iterations)
+        trial = _descend(objective, p, Start(states), iterations)
         loss = (
             trial.misfit * self.rms**2 / self.layout.count if np.isfinite(trial.misfit) else np.inf
         )
@@ -290,7 +290,9 @@ class TermRuns:
     def equations(self, point: Point, able: Able = None, scored: Any = None) -> Equations:
         """Return the normal equations of physics and all terms about a point, for p itself.
 
-        Args: able: terms that may be chosen, beside those that are; the columns of others are zero.
+        Args:
+            point: the model about which the free run is linearised.
+            able: terms that may be chosen, beside those that are; the columns of others are zero.
             scored: which steps of the segments count, or which range of rows one step ahead; None
             for all.
         """
@@ -336,7 +338,7 @@ class TermRuns:
         return self._step_equations_of(slice(None))
 
     def _step_equations_of(self, part: slice) -> Equations:
-        """The same over a range of rows, counted over the experiments."""
+        """Return these equations over a range of rows, counted over the experiments."""
         found, before = [], 0
         for experiment in self.problem.record.experiments:
             (x, y), factors = self.rows(experiment), self.factors(experiment)
@@ -371,7 +373,7 @@ class TermRuns:
         return mean if mean < RUNAWAY * float(self.problem.deviation[0]) ** 2 else np.inf
 
 
-def _descended(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
+def _descend(objective: FreeRunObjective, p: Vector, start: Start, iterations: int) -> TrialPoint:
     """Minimise the misfit by Gauss-Newton steps, with Levenberg-Marquardt where one fails.
 
     About a fitted model the misfit is nearly quadratic. A small step that lowers it by what was

@@ -146,7 +146,7 @@ class Reproduction:
     findings: Callable[[pd.DataFrame], list[Finding]]
 
 
-def trained(
+def train(
     example: Example,
     which: str,
     pipeline: str,
@@ -177,7 +177,9 @@ def trained(
     return estimate(example.train, example.baseline, seed=seed, **options)
 
 
-def drawn(data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False) -> Example:
+def draw_record(
+    data_set: int, *, samples: int = 1024, draw: int = 0, noise: bool = False
+) -> Example:
     """Return the static example's training record drawn anew.
 
     `draw` 0 is the paper's own, as `synthetic.static` has it.
@@ -308,7 +310,7 @@ def scripts_bars(axis: Axes, x: Any, spreads: Sequence[Spread], name: str, **sty
     )
 
 
-def signed(exponent: float) -> str:
+def signed_text(exponent: float) -> str:
     """Return two decimals with a true minus."""
     return f"{exponent:.2f}".replace("-", "−")
 

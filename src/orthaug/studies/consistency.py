@@ -17,16 +17,16 @@ from orthaug.studies.common import (
     Finding,
     Reproduction,
     against_samples,
-    drawn,
+    draw_record,
     extremes,
     legend,
     mean_errors,
     panels,
     rows_of,
-    signed,
+    signed_text,
     slope,
     span,
-    trained,
+    train,
     whiskers,
 )
 from orthaug.studies.data_length import SIZES, limit
@@ -41,7 +41,7 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
 
     Each run has its record and start.
     """
-    example = drawn(data_set, samples=samples, draw=run, noise=True)
+    example = draw_record(data_set, samples=samples, draw=run, noise=True)
     price = None
     if curve == "orthogonal":
         fit = estimate(example.train, example.baseline, learner=None)
@@ -55,7 +55,7 @@ def one(data_set: int, samples: int, curve: str, run: int, pipeline: str) -> dic
             "iterations": 100 if samples < 10_000 else 50,
             "regularization": prior,
         }
-        fit = trained(example, "static", pipeline, seed=run, **options)
+        fit = train(example, "static", pipeline, seed=run, **options)
         if curve == "uniform":
             fit = fit.split(UNIFORM)
             price = fit.measure.price if fit.measure is not None else None
@@ -141,7 +141,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         )
         why = f"the mean goes from {first} to {last}; 1/√N is −0.5"
         quantity = f"set {data_set}, 30 dB, {curve}: exponent of ‖θ* − θ̂‖ in N"
-        compared.append(Finding(quantity, signed(rate), why, published, as_published=met))
+        compared.append(Finding(quantity, signed_text(rate), why, published, as_published=met))
     last = mean_errors(rows_of(table, data_set=3, curve="orthogonal")).iloc[-1]
     quantity = f"set 3, 30 dB, orthogonal: ‖θ* − θ̂‖ at N = {int(last.samples)}"
     away = 100 * abs(last.theta_error / limit(3) - 1)

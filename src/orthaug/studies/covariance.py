@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug.inference.covariance import joint_covariance
-from orthaug.studies.common import Drawing, Finding, Reproduction, panels, trained
+from orthaug.studies.common import Drawing, Finding, Reproduction, panels, train
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
 
@@ -25,7 +25,7 @@ def one(seed: int, pipeline: str) -> dict[str, Any]:
 
     "pseudo" is P̂ with the pseudo-inverse of the weights' block, which is singular to rounding.
     """
-    fit = trained(static(1, noise=True), "static", pipeline, seed=seed)
+    fit = train(static(1, noise=True), "static", pipeline, seed=seed)
     matrix = fit.joint_covariance("paper") * len(fit.problem.rows)
     pseudo = np.abs(joint_covariance(fit.problem, fit.model, "paper", own_units=True)) * len(
         fit.problem.rows
@@ -51,7 +51,10 @@ def study(pipeline: str, small: bool) -> Study:
 
 
 def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
-    """Figure "covariance": entries of the first start, as correlations and, as in the paper, in absolute value."""
+    """Return the figure "covariance": entries of the first start.
+
+    They are drawn as correlations and, as in the paper, in absolute value.
+    """
     figure, axes = panels(2, height=3.3)
     row = table.iloc[0]
     titles = {"correlation": "entries over √(Pᵢᵢ Pⱼⱼ)", "pseudo": "entries in absolute value"}

@@ -17,15 +17,15 @@ from orthaug.studies.common import (
     Finding,
     Reproduction,
     against_samples,
-    drawn,
+    draw_record,
     extremes,
     legend,
     mean_errors,
     panels,
     rows_of,
-    signed,
+    signed_text,
     slope,
-    trained,
+    train,
     whiskers,
 )
 from orthaug.studies.study import Study
@@ -42,11 +42,11 @@ def one(data_set: int, samples: int, measure: str, draw: int, pipeline: str) -> 
 
     θ is Φ⁺Y for the training measure, the split of a trained model for the uniform one.
     """
-    example = drawn(data_set, samples=samples, draw=draw)
+    example = draw_record(data_set, samples=samples, draw=draw)
     if measure == "training":
         fit = estimate(example.train, example.baseline, learner=None)
     else:
-        fit = trained(example, "static", pipeline, iterations=100).split(UNIFORM)
+        fit = train(example, "static", pipeline, iterations=100).split(UNIFORM)
     return {"theta": fit.theta, "theta_error": float(np.linalg.norm(fit.theta - example.theta))}
 
 
@@ -131,7 +131,9 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     )
     quantity, met = "set 2, no noise: exponent of ‖θ* − θ̂‖ in N", bool(-0.7 < rate < -0.3)
     compared.append(
-        Finding(quantity, signed(rate), f"{why}; 1/√N is −0.5", "converges to 0", as_published=met)
+        Finding(
+            quantity, signed_text(rate), f"{why}; 1/√N is −0.5", "converges to 0", as_published=met
+        )
     )
     last = float(three.theta_error.iloc[-1])
     away = last / limit(3) - 1

@@ -28,7 +28,7 @@ from orthaug.studies.common import (
     panels,
     scripts_bars,
     span,
-    trained,
+    train,
     whiskers,
 )
 from orthaug.studies.study import Study
@@ -60,7 +60,7 @@ def one(structure: str, weight: float, seed: int, pipeline: str) -> dict[str, An
         else Additive()
     )
     options = {"structure": chosen, "seed": seed, "iterations": ITERATIONS}
-    fit = trained(example, "mass_spring_damper", pipeline, **options)
+    fit = train(example, "mass_spring_damper", pipeline, **options)
     return {
         "theta": fit.theta,
         "theta_error": float(np.linalg.norm(fit.theta / example.theta - 1)),
@@ -104,7 +104,9 @@ def study(pipeline: str, small: bool) -> Study:
     return Study("regularization_weight", one, grid, where=_runs)
 
 
-def _of(table: pd.DataFrame, structure: str, weight: float | None = None) -> pd.DataFrame:
+def _rows_of_structure(
+    table: pd.DataFrame, structure: str, weight: float | None = None
+) -> pd.DataFrame:
     """Return a structure's rows; those of the weight 0 belong to both penalties."""
     kept = table.structure == structure
     if structure == "baseline-penalty":
@@ -144,7 +146,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
 def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
     positive = table.weight[table.weight > 0]
     zero = positive.min() / 100  # where a logarithmic axis shows the weight 0
-    band = np.array(_of(table, "orthogonal")[quantity])
+    band = np.array(_rows_of_structure(table, "orthogonal")[quantity])
     axis.axhspan(band.min(), band.max(), color=COLOURS["orthogonal"], alpha=0.2, linewidth=0)
     axis.axhline(
         float(np.median(band)),
@@ -153,7 +155,7 @@ def _panel(axis: Axes, table: pd.DataFrame, quantity: str) -> None:
         label=LABELS["orthogonal"],
     )
     for k, structure in enumerate(PENALTIES):
-        errors = extremes(_of(table, structure), "weight", quantity)
+        errors = extremes(_rows_of_structure(table, structure), "weight", quantity)
         place = errors.weight.where(errors.weight > 0, zero) * 1.3 ** (k - 0.5)
         whiskers(axis, place, errors, structure)
         spreads = {weight: _scripts(structure, weight, quantity) for weight in errors.weight}
@@ -189,7 +191,7 @@ def _scripts(structure: str, weight: float, quantity: str) -> references.Spread 
 
 def findings(table: pd.DataFrame) -> list[Finding]:
     """Return the paper's trends, and both errors with the scripts' at every weight they ran."""
-    own = _of(table, "orthogonal")
+    own = _rows_of_structure(table, "orthogonal")
     compared = []
     for quantity, label in (
         ("theta_error", "relative error of θ"),
@@ -204,7 +206,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         compared.append(
             Finding(text, span(own[quantity]), why, scripts=str(scripts), as_scripts=met)
         )
-    rows = _of(table, "orthogonal-penalty", 0.0)
+    rows = _rows_of_structure(table, "orthogonal-penalty", 0.0)
     met = bool(rows.theta_error.max() > 2 * rows.theta_error.min())
     why = (
         f"the largest over starts is {rows.theta_error.max() / rows.theta_error.min():.3g} "
@@ -212,10 +214,12 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     )
     quantity = "λ = 0, the additive structure: relative error of θ"
     compared.append(Finding(quantity, span(rows.theta_error), why, "not unique", as_published=met))
-    return compared + _ends(table) + _prices(table) + _weights(table) + [_converged(table)]
+    return (
+        compared + _ends(table) + _prices(table) + _weights(table) + [_convergence_finding(table)]
+    )
 
 
-def _converged(table: pd.DataFrame) -> Finding:
+def _convergence_finding(table: pd.DataFrame) -> Finding:
     done = int(table.converged.sum())
     return Finding(
         "runs that converged",
@@ -231,7 +235,7 @@ def _ends(table: pd.DataFrame) -> list[Finding]:
         PENALTIES, _limits(), ("the orthogonal structure's θ", "the initial θ⁰"), strict=True
     )
     for structure, limit, what in limits:
-        errors = _of(table, structure, table.weight.max()).theta_error
+        errors = _rows_of_structure(table, structure, table.weight.max()).theta_error
         away = float(errors.mean() / limit - 1)
         quantity = f"{structure}, λ = {table.weight.max():g}: relative error of θ"
         why, met = f"{percent(abs(away))} from that θ's, {limit:.5g}", bool(abs(away) < 0.05)
@@ -244,9 +248,9 @@ def _prices(table: pd.DataFrame) -> list[Finding]:
 
     It is "slightly reduced" accuracy in the paper.
     """
-    own = float(_of(table, "orthogonal").one_step.mean())
+    own = float(_rows_of_structure(table, "orthogonal").one_step.mean())
     means = {
-        structure: _of(table, structure).groupby("weight").one_step.mean()
+        structure: _rows_of_structure(table, structure).groupby("weight").one_step.mean()
         for structure in PENALTIES
     }
     ratios = means["orthogonal-penalty"].drop(0.0) / own
@@ -298,7 +302,7 @@ def _weights(table: pd.DataFrame) -> list[Finding]:
         for weight in sorted(table.weight[table.structure == structure].unique()):
             scripts = _scripts(structure, weight, "theta_error")
             if scripts is not None:
-                errors = _of(table, structure, weight).theta_error
+                errors = _rows_of_structure(table, structure, weight).theta_error
                 met, why = scripts.beside(errors)
                 nearer = abs(errors.mean() - limit) < abs(scripts.mean - limit)
                 why += (

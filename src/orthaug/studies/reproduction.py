@@ -82,7 +82,7 @@ def catalogue() -> dict[str, Reproduction]:
     return {module.REPRODUCTION.name: module.REPRODUCTION for module in modules}
 
 
-def chosen(name: str | None) -> list[Reproduction]:
+def choose_studies(name: str | None) -> list[Reproduction]:
     """Return the studies to run: one by name, or all.
 
     Raises:
@@ -158,7 +158,7 @@ def write(
             "counts": _counts(reproduced)._asdict(),
             "size": _size(reproduced),
             "findings": as_rows(reproduced),
-            "runs": {study.entry.name: when(study.runs) for study in reproduced},
+            "runs": {study.entry.name: when_text(study.runs) for study in reproduced},
         }
         (partial / MARK).write_text(
             json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
@@ -179,7 +179,7 @@ def _counts(reproduced: Sequence[StudyOutcome]) -> Counts:
     return Counts.of(finding for study in reproduced for finding in study.findings)
 
 
-def reduced(reproduced: Sequence[StudyOutcome]) -> str:
+def reduced_text(reproduced: Sequence[StudyOutcome]) -> str:
     """Return what the reduced size means for the comparisons; empty at full size."""
     some = [study for study in reproduced if study.small]
     if not some:
@@ -198,12 +198,12 @@ def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, Any]:
     }
     return {
         "small": any(study.small for study in reproduced),
-        "text": reduced(reproduced) or None,
+        "text": reduced_text(reproduced) or None,
         "studies": studies,
     }
 
 
-def when(done: Sequence[Run]) -> str:
+def when_text(done: Sequence[Run]) -> str:
     """Return how many runs were made now or read from a store, when, and their seconds."""
     parts = []
     for stored in (False, True):
@@ -244,14 +244,14 @@ def text(reproduced: Sequence[StudyOutcome]) -> str:
             table.add_column(name, ratio=ratio, overflow="fold")
         for row in study.findings:
             references = ((row.published, row.as_published), (row.scripts, row.as_scripts))
-            marked = (_marked(*pair, study.small) for pair in references)
+            marked = (_mark(*pair, study.small) for pair in references)
             table.add_row(row.quantity, *marked, row.ours, row.verdict)
         console.print(table, markup=False, highlight=False)
         if study.small:
             console.print(
                 f"small: {len(study.runs)} of {study.whole} runs\n", markup=False, highlight=False
             )
-    note = reduced(reproduced)
+    note = reduced_text(reproduced)
     if note:
         console.print(note, markup=False, highlight=False)
     counts = _counts(reproduced)
@@ -265,7 +265,7 @@ def text(reproduced: Sequence[StudyOutcome]) -> str:
     return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
 
 
-def _marked(reference: str, met: bool | None, small: bool) -> str:
+def _mark(reference: str, met: bool | None, small: bool) -> str:
     if met is None:
         return reference or "–"
     return f"{reference} ({'met' if met else 'differs at small size' if small else 'differs'})"
@@ -285,7 +285,7 @@ def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
             "findings": study.findings,
             "figures": [(drawing, _inline(drawing.figure)) for drawing in study.figures.values()],
             "counts": Counts.of(study.findings),
-            "when": when(study.runs),
+            "when": when_text(study.runs),
             "small": study.small,
             "size": f"{len(study.runs)} of {study.whole} runs",
         }
@@ -296,7 +296,7 @@ def _page(reproduced: Sequence[StudyOutcome], pipeline: str) -> str:
         theory=THEORY,
         trained=PIPELINES[pipeline],
         version=__version__,
-        reduced=reduced(reproduced),
+        reduced=reduced_text(reproduced),
         counts=_counts(reproduced),
     )
 

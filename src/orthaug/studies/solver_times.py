@@ -42,7 +42,7 @@ SOLVERS = {  # label, colour, marker
 NOISY = 1.25  # the slowest over the fastest start, per iteration, from which a time is no result
 
 
-def declared(name: str, example: str, share: float) -> Any:
+def declare_solver(name: str, example: str, share: float) -> Any:
     """Return a solver with a share of its iterations.
 
     Gradient solvers have the paper's numbers, ours 300.
@@ -63,8 +63,8 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
     given = static(1) if example == "static" else mass_spring_damper()
     task = OneStepTask.of(pose(given.train, given.baseline), MLP())
     assert task.bound is not None
-    start, chosen = task.bound.init(jax.random.key(seed)), declared(solver, example, share)
-    task.run(declared(solver, example, 0.01), start, Orthogonal())
+    start, chosen = task.bound.init(jax.random.key(seed)), declare_solver(solver, example, share)
+    task.run(declare_solver(solver, example, 0.01), start, Orthogonal())
     run = task.run(chosen, start, Orthogonal())
     return {"seconds": run.seconds, "loss": task.loss(run), "iterations": run.iterations}
 

@@ -26,7 +26,7 @@ from orthaug.studies.common import (
     rows_of,
     scripts_bars,
     span,
-    trained,
+    train,
 )
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
@@ -51,7 +51,7 @@ def one(data_set: int, structure: str, seed: int, pipeline: str) -> dict[str, An
     θ under the uniform measure and the learner on a grid of inputs are added.
     """
     example = static(data_set)
-    fit = trained(example, "static", pipeline, structure=STRUCTURES[structure], seed=seed)
+    fit = train(example, "static", pipeline, structure=STRUCTURES[structure], seed=seed)
     uniform = fit.split(UNIFORM)
     x = GRID[:, None]
     physics = np.stack([GRID, GRID**3], axis=-1)
@@ -112,7 +112,7 @@ def figures(table: pd.DataFrame) -> Mapping[str, Drawing]:
     }
 
 
-def _shown(table: pd.DataFrame) -> list[str]:
+def _shown_structures(table: pd.DataFrame) -> list[str]:
     """Return the structures of the table, in the order in which they are drawn."""
     return [
         name
@@ -121,14 +121,16 @@ def _shown(table: pd.DataFrame) -> list[str]:
     ]
 
 
-def _both(table: pd.DataFrame) -> bool:
-    return "additive-initial" in _shown(table)
+def _has_both(table: pd.DataFrame) -> bool:
+    return "additive-initial" in _shown_structures(table)
 
 
 def _label(structure: str, table: pd.DataFrame) -> str:
     """Return the label of a structure; the additive one is qualified where there are both."""
     return (
-        "additive, θ eliminated" if structure == "additive" and _both(table) else LABELS[structure]
+        "additive, θ eliminated"
+        if structure == "additive" and _has_both(table)
+        else LABELS[structure]
     )
 
 
@@ -139,7 +141,7 @@ def _of_scripts(structure: str, table: pd.DataFrame) -> str | None:
     """
     if structure == "orthogonal":
         return structure
-    return None if structure == "additive" and _both(table) else "additive"
+    return None if structure == "additive" and _has_both(table) else "additive"
 
 
 def _errors(table: pd.DataFrame) -> Figure:
@@ -147,7 +149,9 @@ def _errors(table: pd.DataFrame) -> Figure:
     sets = np.arange(1, 4)
     columns = (("test_rmse", "test RMSE of y"), ("theta_error", "‖θ* − θ̂‖"))
     for axis, (column, label) in zip(axes, columns, strict=True):
-        kinds = [(structure, _of_scripts(structure, table)) for structure in _shown(table)]
+        kinds = [
+            (structure, _of_scripts(structure, table)) for structure in _shown_structures(table)
+        ]
         places = iter(np.linspace(-0.36, 0.36, 1 + sum(1 + (of is not None) for _, of in kinds)))
         for structure, of in kinds:
             rows = rows_of(table, structure=structure)
@@ -206,7 +210,7 @@ def _theta(table: pd.DataFrame) -> Figure:
             label="initial θ⁰",
             zorder=5,
         )
-        for structure in _shown(table):
+        for structure in _shown_structures(table):
             theta = np.array(rows_of(rows, structure=structure).theta.tolist())
             style = {
                 "color": COLOURS[structure],
@@ -231,7 +235,7 @@ def _theta(table: pd.DataFrame) -> Figure:
 
 
 def _learner(table: pd.DataFrame) -> Figure:
-    shown = list(reversed(_shown(table)))
+    shown = list(reversed(_shown_structures(table)))
     figure, axes = panels(len(shown), sharey=True)
     for axis, structure in zip(axes, shown, strict=True):
         rows = rows_of(table, data_set=1, structure=structure)
@@ -253,7 +257,7 @@ def findings(table: pd.DataFrame) -> list[Finding]:
     """Return both errors of every data set and structure, with those of scripts and paper."""
     compared = []
     for data_set in (1, 2, 3):
-        for structure in reversed(_shown(table)):
+        for structure in reversed(_shown_structures(table)):
             compared.append(_rmse_finding(table, data_set, structure))
             compared.append(_theta_finding(table, data_set, structure))
     for data_set in (2, 3):

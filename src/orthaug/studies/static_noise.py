@@ -25,7 +25,7 @@ from orthaug.studies.common import (
     panels,
     rows_of,
     span,
-    trained,
+    train,
 )
 from orthaug.studies.study import Study
 from orthaug.studies.synthetic import static
@@ -52,7 +52,7 @@ def one(structure: str, regularization: str, seed: int, pipeline: str) -> dict[s
     from_initial = structure == "additive" and pipeline == "ours" and prior == "none"
     chosen = Additive(from_initial=True) if from_initial else STRUCTURES[structure]
     options = {"structure": chosen, "regularization": prior, "iterations": iterations}
-    fit = trained(example, "static", pipeline, seed=seed, **options)
+    fit = train(example, "static", pipeline, seed=seed, **options)
     return {
         "theta": fit.theta,
         "theta_error": float(np.linalg.norm(fit.theta - example.theta)),
@@ -128,7 +128,8 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         where, scripts = f"set 1, 30 dB, {structure}", _scripts(structure)
         squares, printed = TEST_SAMPLES * rows.test_rmse**2, SQUARES[structure]
         met, why = _beside_printed(squares, printed)
-        why += f"; run again, the scripts print {scripts['test_sse']}{_stopped(table, structure)}"
+        why += f"; run again, the scripts print {scripts['test_sse']}"
+        why += _stopping_sentence(table, structure)
         compared.append(
             Finding(
                 f"{where}: sum of squared test errors",
@@ -146,12 +147,15 @@ def findings(table: pd.DataFrame) -> list[Finding]:
         )
         compared.append(_theta_finding(table if structure == "orthogonal" else plain, structure))
     for kind in dict.fromkeys(table.regularization[table.regularization != "none"]):
-        compared += _regularized(table, kind)
+        compared += _regularization_findings(table, kind)
     return compared
 
 
-def _stopped(table: pd.DataFrame, structure: str) -> str:
-    """Return what the same sum is when training stops early, where that was run: what is trained longer fits noise."""
+def _stopping_sentence(table: pd.DataFrame, structure: str) -> str:
+    """Return a sentence on the same sum when training stops early, where that was run.
+
+    A network that is trained longer fits noise.
+    """
     own = rows_of(table, structure=structure)
     early, full = (rows_of(own, regularization=kind) for kind in ("stopping", "none"))
     if early.empty:
@@ -207,7 +211,7 @@ def _theta_finding(rows: pd.DataFrame, structure: str) -> Finding:
     )
 
 
-def _regularized(table: pd.DataFrame, kind: str) -> list[Finding]:
+def _regularization_findings(table: pd.DataFrame, kind: str) -> list[Finding]:
     """Return the effect of a regularization on the errors.
 
     One row where both structures predict the same.

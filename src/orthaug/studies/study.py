@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import finite_or_none
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug._base.parallel import spread
+from orthaug._base.parallel import run_all
 from orthaug.models.tasks import ask, places
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def runs(
         if progress is not None:
             progress(done, len(cases))
 
-    spread(run_case, todo, wanted)
+    run_all(run_case, todo, wanted)
     return [run for run in found if run is not None]
 
 

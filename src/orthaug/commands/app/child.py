@@ -20,11 +20,11 @@ def main() -> None:
     """Run the command that the arguments give."""
     from orthaug.commands.entry import main as program
 
-    watched()
+    watch_parent()
     program()
 
 
-def watched() -> None:
+def watch_parent() -> None:
     """End this process once its standard input is closed."""
     _thread.start_new_thread(_wait, ())
 

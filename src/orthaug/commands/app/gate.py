@@ -76,8 +76,8 @@ class Gate:
         given = dict(query).get("token")
         comes = scope["type"] == "http" and scope["method"] in ("GET", "HEAD")
         allowed = self._from_here(headers) and (
-            _same(given, self.token)
-            or _same(self._kept(headers), self._secret)
+            _equal_secrets(given, self.token)
+            or _equal_secrets(self._cookie_of(headers), self._secret)
             or (comes and self._spend(given))
         )
         if not allowed:
@@ -96,7 +96,7 @@ class Gate:
             origin is None or origin in {f"http://{host}" for host in hosts}
         )
 
-    def _kept(self, headers: Mapping[str, str]) -> str | None:
+    def _cookie_of(self, headers: Mapping[str, str]) -> str | None:
         try:
             morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
@@ -105,7 +105,7 @@ class Gate:
 
     def _spend(self, token: str | None) -> bool:
         """Take a ticket; return whether it was still unused."""
-        found = next((ticket for ticket in self._tickets if _same(token, ticket)), None)
+        found = next((ticket for ticket in self._tickets if _equal_secrets(token, ticket)), None)
         self._tickets.discard(found or "")
         return found is not None
 
@@ -121,7 +121,7 @@ class Gate:
         await send({"type": "http.response.body", "body": b""})
 
 
-def _same(given: str | None, secret: str) -> bool:
+def _equal_secrets(given: str | None, secret: str) -> bool:
     return given is not None and hmac.compare_digest(given.encode(), secret.encode())
 
 
@@ -150,7 +150,7 @@ def _with_headers(send: Send) -> Send:
     Headers that an answer has already are kept.
     """
 
-    async def sending(message: Message) -> None:
+    async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
             own = list(message.get("headers", []))
             said = {name.lower() for name, _ in own}
@@ -158,4 +158,4 @@ def _with_headers(send: Send) -> Send:
             message = {**message, "headers": own}
         await send(message)
 
-    return sending
+    return send_with_headers

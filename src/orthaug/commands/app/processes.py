@@ -57,7 +57,7 @@ class Command:
 
     @property
     def running(self) -> bool:
-        """Whether the process still runs."""
+        """True while the process still runs."""
         return self.code is None
 
     @property
@@ -79,13 +79,13 @@ class Command:
         """Start the command and follow it to its end; one that cannot start counts as failed."""
         self.began = time.monotonic()
         try:
-            self.code = await self._followed()
+            self.code = await self._follow()
         except OSError as error:
             self.lines, self.code = [f"error: the command cannot start ({error.strerror})."], 2
         self.ended = time.monotonic()
         self.changed()
 
-    async def _followed(self) -> int:
+    async def _follow(self) -> int:
         """Return the exit code of the command."""
         program = [sys.executable, "-m", "orthaug.commands.app.child", *self.arguments]
         self.process = await asyncio.create_subprocess_exec(
@@ -166,11 +166,11 @@ class WorkerPool:
             InputError: the question was refused.
         """
         async with self._room:
-            process = await self._taken()
+            process = await self._take()
             self._busy.add(process)
             answer: dict[str, Any] = {"last": True}
             try:
-                answer = await _answered(process, {"question": question, **given})
+                answer = await _ask_worker(process, {"question": question, **given})
             finally:
                 self._busy.discard(process)
                 if answer["last"]:
@@ -185,16 +185,16 @@ class WorkerPool:
     def prepare(self) -> None:
         """Start a process that waits for the next question."""
         if self._coming is None and not self._idle:
-            self._coming = asyncio.ensure_future(_started())
+            self._coming = asyncio.ensure_future(_start_worker())
 
-    async def _taken(self) -> asyncio.subprocess.Process:
+    async def _take(self) -> asyncio.subprocess.Process:
         while self._idle:
             process = self._idle.pop()
             if process.returncode is None:
                 return process
         coming, self._coming = self._coming, None
         if coming is None or (coming.done() and coming.exception()):  # or it could not start then
-            coming = asyncio.ensure_future(_started())
+            coming = asyncio.ensure_future(_start_worker())
         try:
             return await asyncio.shield(coming)
         except asyncio.CancelledError:
@@ -214,7 +214,7 @@ class WorkerPool:
                 await asyncio.wait_for(process.wait(), _GRACE)
 
 
-async def _started() -> asyncio.subprocess.Process:
+async def _start_worker() -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "orthaug.commands.app.worker"),
         stdin=asyncio.subprocess.PIPE,
@@ -225,7 +225,7 @@ async def _started() -> asyncio.subprocess.Process:
     )
 
 
-async def _answered(
+async def _ask_worker(
     process: asyncio.subprocess.Process, question: dict[str, Any]
 ) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None

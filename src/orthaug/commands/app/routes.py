@@ -104,26 +104,31 @@ class Page:
         now, seen = dict(self.session.versions), self.seen
         self.seen = now
 
-        def moved(what: str) -> bool:
+        def has_moved(what: str) -> bool:
             return now.get(what, 0) != seen.get(what, 0)
 
         looks: list[Callable[[], None]] = []
-        if moved("data"):
+        if has_moved("data"):
             looks += [self.data.follow_data, self.model.follow_data]
-        if moved("spec"):
+        if has_moved("spec"):
             authors = set(self.session.authors[seen.get("spec", 0) :])
             author = authors.pop() if len(authors) == 1 else ""
             looks += [
                 partial(self.data.follow_spec, author),
                 partial(self.model.follow_spec, author),
             ]
-        if moved("check"):
+        if has_moved("check"):
             looks += [self.data.follow_check, self.model.follow_check]
-        if moved("work") or moved("spec") or moved("data") or self.session.running is not None:
+        if (
+            has_moved("work")
+            or has_moved("spec")
+            or has_moved("data")
+            or self.session.running is not None
+        ):
             looks.append(self.training.follow_work)
-        elif moved("check"):
+        elif has_moved("check"):
             looks.append(self.training.follow_check)
-        if moved("work") or moved("spec"):
+        if has_moved("work") or has_moved("spec"):
             looks += [self.report.follow_work, self.export.follow_work]
         if now != seen:
             looks.append(self._name)
@@ -160,7 +165,7 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
 
     @app.put("/session/{key}/file/{name}")
     async def drop(key: str, name: str, request: Request) -> Response:
-        return await _kept(sessions, key, name, request)
+        return await _keep_upload(sessions, key, name, request)
 
     @app.get("/session/{key}/get/{what}")
     def get(key: str, what: str, show: bool = False) -> Response:
@@ -200,30 +205,30 @@ def application(sessions: Sessions, spec: Path | None) -> FastAPI:
     return app
 
 
-async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Response:
+async def _keep_upload(sessions: Sessions, key: str, name: str, request: Request) -> Response:
     """Return the answer to an upload: the file is written piece by piece, then examined."""
     session = sessions.find(key)
     if session is None:
-        return _refused("this session has ended; open the page anew.", 404)
+        return _refuse("this session has ended; open the page anew.", 404)
     partial: Path | None = None
     declared = request.headers.get("content-length", "")
     if declared.isdecimal() and int(declared) > LARGEST:
-        return _refused(_TOO_LARGE.format(in_words(LARGEST)), 413)
+        return _refuse(_TOO_LARGE.format(in_words(LARGEST)), 413)
     try:
         partial, size = session.begin_file(name), 0
         with partial.open("wb") as file:
             async for piece in request.stream():
                 size += len(piece)
                 if size > LARGEST:
-                    return _refused(_TOO_LARGE.format(in_words(LARGEST)), 413)
+                    return _refuse(_TOO_LARGE.format(in_words(LARGEST)), 413)
                 file.write(piece)
         place, note = session.keep_file(partial, name)
     except InputError as error:
-        return _refused(str(error), 422)
+        return _refuse(str(error), 422)
     except ClientDisconnect:
-        return _refused("only a part of the file arrived.", 400)
+        return _refuse("only a part of the file arrived.", 400)
     except OSError as error:
-        return _refused(f"the file cannot be kept ({error.strerror}).", 507)
+        return _refuse(f"the file cannot be kept ({error.strerror}).", 507)
     finally:
         if partial is not None:
             with suppress(OSError):
@@ -232,7 +237,7 @@ async def _kept(sessions: Sessions, key: str, name: str, request: Request) -> Re
     return JSONResponse({"kept": place.name, "note": note})
 
 
-def _refused(text: str, code: int) -> Response:
+def _refuse(text: str, code: int) -> Response:
     return JSONResponse({"refused": text}, code)
 
 

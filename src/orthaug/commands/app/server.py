@@ -96,7 +96,7 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
 def _asked_to_end() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C sets; a second Ctrl-C ends the program at once."""
     if WATCH.active:
-        with WATCH.asking() as event:
+        with WATCH.ask_to_stop() as event:
             yield event
     else:
         event = threading.Event()

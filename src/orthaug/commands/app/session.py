@@ -87,10 +87,10 @@ class Session:
 
     @property
     def untouched(self) -> bool:
-        """Whether the session has not been used yet."""
+        """True if the session has not been used yet."""
         return not self.commands and self.data is None and set(self.authors) <= {"file"}
 
-    def changed(self, what: str) -> None:
+    def mark_changed(self, what: str) -> None:
         """Mark the session as changed, so that every page of it redraws."""
         self.versions[what] += 1
 
@@ -98,16 +98,16 @@ class Session:
         """Start a coroutine without waiting for it."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
-        task.add_done_callback(self._ended)
+        task.add_done_callback(self._report_failure)
         return task
 
-    def _ended(self, task: asyncio.Task[Any]) -> None:
+    def _report_failure(self, task: asyncio.Task[Any]) -> None:
         """Report the error of a task that has failed."""
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             LOG.error("a task of the page failed", exc_info=error)
             self.trouble = f"this did not work ({type(error).__name__})."
-            self.changed("data")
+            self.mark_changed("data")
 
     @property
     def first_step(self) -> str:
@@ -178,12 +178,12 @@ class Session:
     def _look_again(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
         if self._look is not None:
             self._look.cancel()
-        self._look = self.start(self._looked(inputs, outputs, step))
+        self._look = self.start(self._look_at(inputs, outputs, step))
 
-    async def _looked(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
+    async def _look_at(self, inputs: str | None, outputs: str | None, step: float | None) -> None:
         assert self.data is not None
         self.looking, self.trouble, self.unfit = f"Looking at {self.data.name} …", "", ""
-        self.changed("data")
+        self.mark_changed("data")
         place = self.folder / "spec.toml"
         try:
             found = await self.desk.ask(
@@ -199,16 +199,16 @@ class Session:
                 self._begin(found["spec"])
         except InputError as error:
             if self.found is None:
-                self.trouble = self.worded(error)
+                self.trouble = self.reword(error)
             else:
-                self.unfit = self.worded(error)
+                self.unfit = self.reword(error)
         finally:
             self.looking = ""
-            self.changed("data")
+            self.mark_changed("data")
 
     @property
     def _may_begin(self) -> bool:
-        """Whether looking at a file may begin the spec.
+        """True if looking at a file may begin the spec.
 
         It may where there is no spec, or one that an earlier look began and nobody has edited.
         """
@@ -223,7 +223,7 @@ class Session:
 
     @property
     def apart(self) -> bool:
-        """Whether the spec does not name the file that was looked at."""
+        """True if the spec does not name the file that was looked at."""
         return self.data is not None and bool(self.spec.strip()) and not self.names(self.data)
 
     def names(self, file: Path) -> bool:
@@ -240,7 +240,7 @@ class Session:
         while name in taken:
             name += "_"
         self.edit("test", with_value, ("data", "tests", name), {"files": [file]})
-        self.changed("data")
+        self.mark_changed("data")
 
     def open_spec(self, path: Path, *, kept: bool = False) -> None:
         """Open a spec from a file, or one of earlier work that was kept.
@@ -257,7 +257,7 @@ class Session:
         )
         self.title = kept_title(path) if kept else path.name
         self.write(text, "file")
-        self.changed("data")
+        self.mark_changed("data")
 
     # Spec
 
@@ -267,7 +267,7 @@ class Session:
             return
         self.spec = text
         self.authors.append(author)
-        self.changed("spec")
+        self.mark_changed("spec")
         if author != "file" and text.strip():
             self.kept_as = self.kept_as or _as_name(self.title) or "spec"
             keep(self.kept_as, self.key, text)
@@ -281,14 +281,14 @@ class Session:
         if self._check is not None:
             self._check.cancel()
         self.checking = bool(self.spec.strip())
-        self.changed("check")
-        self._check = self.start(self._checked())
+        self.mark_changed("check")
+        self._check = self.start(self._run_check())
 
-    async def _checked(self) -> None:
+    async def _run_check(self) -> None:
         await asyncio.sleep(_PAUSE)
         if not self.spec.strip():
             self.checked, self.refused, self.stale = None, "", False
-            self.changed("check")
+            self.mark_changed("check")
             return
         place = self.folder / "check.toml"
         place.write_text(self.spec, encoding="utf-8")
@@ -296,13 +296,13 @@ class Session:
             self.checked = await self.desk.ask("examine", path=place, whole=False)
             if self.checked["check"] is None:
                 self.refused, self.stale = "", False
-                self.changed("check")
+                self.mark_changed("check")
                 self.checked = await self.desk.ask("examine", path=place, whole=True)
-            self.refused, self.stale = self.worded(self.checked["refusal"] or ""), False
+            self.refused, self.stale = self.reword(self.checked["refusal"] or ""), False
         except InputError as error:
-            self.refused, self.stale = self.worded(error), True
+            self.refused, self.stale = self.reword(error), True
         self.checking = False
-        self.changed("check")
+        self.mark_changed("check")
 
     @property
     def units(self) -> dict[str, str]:
@@ -321,7 +321,7 @@ class Session:
         except InputError:
             return {}
 
-    def worded(self, text: Any) -> str:
+    def reword(self, text: Any) -> str:
         """Return a message without the session's own folder and file names."""
         text = (
             str(text)
@@ -349,16 +349,16 @@ class Session:
         shutil.rmtree(self.folder / f"{kind}.training", ignore_errors=True)
         self.exports.clear()
         arguments = (kind, str(place), "--out", str(self.folder / kind), "--force")
-        command = self.commands[kind] = Command(arguments, lambda: self.changed("work"))
-        self.changed("work")
-        self.start(self._followed(kind, command, self.spec))
+        command = self.commands[kind] = Command(arguments, lambda: self.mark_changed("work"))
+        self.mark_changed("work")
+        self.start(self._follow_run(kind, command, self.spec))
 
-    async def _followed(self, kind: str, command: Command, spec: str) -> None:
+    async def _follow_run(self, kind: str, command: Command, spec: str) -> None:
         await command.run()
         if command.code == 0:
             self.trained[kind] = spec
             await self._read_result(kind)
-        self.changed("work")
+        self.mark_changed("work")
 
     async def _read_result(self, kind: str) -> None:
         """Read the result in the folder, and the verdict that its report begins with."""
@@ -372,21 +372,21 @@ class Session:
         """Interrupt the training that runs now."""
         if self.running is not None:
             self.running.stop()
-            self.changed("work")
+            self.mark_changed("work")
 
     def finish(self) -> None:
         """Let the training that runs now end with the result reached so far."""
         if self.running is not None:
             self.running.finish()
-            self.changed("work")
+            self.mark_changed("work")
 
     # Downloads
 
     def export(self, target: str, name: str) -> None:
         """Run `orthaug export` on the model."""
-        self.start(self._exported(target, name))
+        self.start(self._run_export(target, name))
 
-    async def _exported(self, target: str, name: str) -> None:
+    async def _run_export(self, target: str, name: str) -> None:
         arguments = (
             "export",
             str(self.folder / "fit"),
@@ -398,11 +398,11 @@ class Session:
         (self.folder / "export").mkdir(exist_ok=True)
         command = Command((*arguments, "--name", name, "--force"), lambda: None)
         self.exports[target] = "…"
-        self.changed("work")
+        self.mark_changed("work")
         await command.run()
         if target in self.exports:  # else another model or another name came in between
-            self.exports[target] = "" if command.code == 0 else self.worded(command.complaint)
-            self.changed("work")
+            self.exports[target] = "" if command.code == 0 else self.reword(command.complaint)
+            self.mark_changed("work")
 
     def download(self, what: str) -> Path:
         """Return the file to download under a name: from a fixed list, never a path.
@@ -423,7 +423,7 @@ class Session:
         if what in single and (self.folder / single[what]).is_file():
             return self.folder / single[what]
         if what in folders and (self.folder / folders[what]).is_dir():
-            return _zipped(self.folder / folders[what], self.folder / f"download-{what}")
+            return _zip_folder(self.folder / folders[what], self.folder / f"download-{what}")
         raise InputError("there is nothing of that name yet.")
 
     async def close(self) -> None:
@@ -475,7 +475,7 @@ def _as_name(text: str) -> str:
     return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 
-def _zipped(folder: Path, place: Path) -> Path:
+def _zip_folder(folder: Path, place: Path) -> Path:
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(folder.rglob("*")):
             if file.is_file():

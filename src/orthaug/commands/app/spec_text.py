@@ -30,7 +30,7 @@ _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 
 
-def opened(text: str) -> tomlkit.TOMLDocument:
+def parse_document(text: str) -> tomlkit.TOMLDocument:
     """Return the document.
 
     Raises:
@@ -51,7 +51,7 @@ def in_file(path: Path) -> str:
     check_readable(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
-        opened(text)
+        parse_document(text)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     except UnicodeDecodeError:
@@ -96,13 +96,13 @@ def _folder() -> Path:
 
 def absolute(text: str, folder: Path) -> str:
     """Return the spec with absolute paths for the files that it names relative to `folder`."""
-    document = opened(text)
+    document = parse_document(text)
     for entry in _with_files(document):
-        entry["files"] = [_whole(folder, file) for file in entry["files"]]
+        entry["files"] = [_absolute_path(folder, file) for file in entry["files"]]
     return tomlkit.dumps(document)
 
 
-def _whole(folder: Path, file: Any) -> Any:
+def _absolute_path(folder: Path, file: Any) -> Any:
     """Return a path as an absolute one, not resolved: links and patterns remain what they are."""
     return Path(os.path.abspath(folder / file)).as_posix() if isinstance(file, str) else file
 
@@ -149,7 +149,7 @@ def names(table: Mapping[str, Any], key: str) -> list[str]:
     return [name for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
-def shown(value: Any) -> str:
+def field_text(value: Any) -> str:
     """Return a value as a field shows it."""
     return (
         ""
@@ -178,7 +178,7 @@ def read(key: str, value: str) -> Any:
     return value
 
 
-def _made(document: Any, path: Sequence[str]) -> Any:
+def _make_table(document: Any, path: Sequence[str]) -> Any:
     """Return the table at the end of the path; it is made where there is none."""
     for key in path:
         if not isinstance(document.get(key), Mapping):
@@ -193,16 +193,16 @@ def plain(text: str) -> dict[str, Any]:
     Raises:
         InputError: broken TOML.
     """
-    return opened(text).unwrap()
+    return parse_document(text).unwrap()
 
 
-def changed(text: str, change: Callable[[Any], None]) -> str:
+def edit_text(text: str, change: Callable[[Any], None]) -> str:
     """Return the text after a change of its document.
 
     Raises:
         InputError: broken TOML, or TOML in which the change cannot be written.
     """
-    document = opened(text)
+    document = parse_document(text)
     change(document)
     written = tomlkit.dumps(document)
     if plain(written) != document.unwrap():
@@ -220,7 +220,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
     """
 
     def change(document: Any) -> None:
-        table = _made(document, path[:-1])
+        table = _make_table(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
         elif isinstance(
@@ -231,7 +231,7 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
         else:
             table[path[-1]] = value
 
-    return changed(text, change)
+    return edit_text(text, change)
 
 
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
@@ -249,7 +249,7 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
     """Return the text with one more table at the end of a list of tables."""
 
     def change(document: Any) -> None:
-        table = _made(document, path[:-1])
+        table = _make_table(document, path[:-1])
         rows = table.get(path[-1])
         if not isinstance(rows, list) or (not rows and not isinstance(rows, AoT)):
             table[path[-1]] = tomlkit.aot()
@@ -260,35 +260,35 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
             new.add(tomlkit.nl())  # before what follows
         rows.append(new)
 
-    return changed(text, change)
+    return edit_text(text, change)
 
 
 def with_field(text: str, path: Sequence[str], index: int, key: str, entered: str) -> str:
     """Return the text with a key of one table of a list set; an empty field removes it."""
 
     def change(document: Any) -> None:
-        row, value = _at(document, path)[index], read(key, entered)
+        row, value = _table_at(document, path)[index], read(key, entered)
         if value is None:
             row.pop(key, None)
         else:
             row[key] = value
 
-    return changed(text, change)
+    return edit_text(text, change)
 
 
 def without_row(text: str, path: Sequence[str], index: int) -> str:
     """Return the text without one table of a list."""
 
     def change(document: Any) -> None:
-        rows = _at(document, path)
+        rows = _table_at(document, path)
         del rows[index]
         if not rows:
-            del _at(document, path[:-1])[path[-1]]
+            del _table_at(document, path[:-1])[path[-1]]
 
-    return changed(text, change)
+    return edit_text(text, change)
 
 
-def _at(document: Any, path: Sequence[str]) -> Any:
+def _table_at(document: Any, path: Sequence[str]) -> Any:
     for key in path:
         document = document[key]
     return document
@@ -304,7 +304,8 @@ MOTION = """
 [motion]
 [motion.states]
 x = {{ derivative = "v", start = "{output}"{x} }}
-v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", learned = true{v} }}
+v = {{ derivative = "({force} - c*v - k*x)/m", start = "derivative of {output}", \
+learned = true{v} }}
 [motion.outputs]
 {output} = "x"
 [motion.parameters]
@@ -337,9 +338,9 @@ def as_motion(text: str) -> str:
         document["motion"] = tomlkit.parse(
             MOTION.format(output=outputs[0], force=inputs[0], **given)
         )["motion"]
-        _made(document, ["learner"])["inputs"] = ["v"]
+        _make_table(document, ["learner"])["inputs"] = ["v"]
 
-    return changed(_without_comments(text, _OF_TERMS), change)
+    return edit_text(_without_comments(text, _OF_TERMS), change)
 
 
 def _without_comments(text: str, phrases: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from orthaug.commands.app.widgets import (
     choice,
     curves_figure,
     field,
-    named,
+    label_widget,
     note,
     plot,
     redrawn,
@@ -149,7 +149,7 @@ class DataView:
                 with ui.element("ul").classes("account"):
                     untold = (
                         _COLUMNS
-                        if session.data in self._trained() or not session.spec
+                        if session.data in self._training_files() or not session.spec
                         else (*_COLUMNS, *_DRAFT)
                     )
                     for line in [one for one in lines[1:] if not one.startswith(untold)]:
@@ -166,20 +166,20 @@ class DataView:
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
         """Offer to use a file that the spec does not name as a test."""
-        message, lacking = "The spec is kept as it is", self._lacking(found)
-        if trained := self._trained():
+        message, lacking = "The spec is kept as it is", self._missing_columns(found)
+        if trained := self._training_files():
             message += f"; it trains on {', '.join(file.name for file in trained)}"
         if lacking:
             message += f". This file has no column {', '.join(lacking)}, which the spec reads"
         note(f"{message}. Use this file as a test of it, or begin anew below.", "care")
         button("Use it as a test", self.session.add_test, main=not lacking)
 
-    def _trained(self) -> list[Path]:
+    def _training_files(self) -> list[Path]:
         """Return the files that the spec trains on."""
         train = spec_text.section(self.session.content(), "data", "train")
         return [self.session.folder / file for file in spec_text.names(train, "files")]
 
-    def _lacking(self, found: Mapping[str, Any]) -> list[str]:
+    def _missing_columns(self, found: Mapping[str, Any]) -> list[str]:
         """Return the columns that the spec reads and the file lacks."""
         heads = {column["header"] for column in found["columns"]}
         return [
@@ -191,7 +191,7 @@ class DataView:
 
         Empty without a spec, or where the file lacks one of its columns.
         """
-        return {} if self._lacking(found) else spec_text.columns(self.session.content())
+        return {} if self._missing_columns(found) else spec_text.columns(self.session.content())
 
     def _take_uses(self, found: Mapping[str, Any]) -> None:
         """Set the use of each column: from the spec, or as chosen, or as the file suggests."""
@@ -303,17 +303,19 @@ class DataView:
 
     def _draw_step(self, index: int, step: Mapping[str, Any]) -> None:
         kind = str(step.get("step"))
-        with named(
+        with label_widget(
             ui.element("div").classes("entry step").props("role=group"), f"step {index + 1}"
         ):
             with ui.element("div").classes("grow"):
                 text(f"{index + 1}. {_SUMMARIES.get(kind, kind)}", "p", "strong")
                 with ui.element("div").classes("fields"):
                     for own in fields(STEPS[kind]) if kind in STEPS else ():
-                        usual = "all" if own.name == "channels" else spec_text.shown(own.default)
+                        usual = (
+                            "all" if own.name == "channels" else spec_text.field_text(own.default)
+                        )
                         field(
                             _LABELS.get(own.name, own.name),
-                            spec_text.shown(step.get(own.name)),
+                            spec_text.field_text(step.get(own.name)),
                             partial(
                                 self.session.edit,
                                 "steps",
@@ -326,7 +328,7 @@ class DataView:
                             hint="" if own.default is MISSING else usual,
                         )
             remove = partial(self.session.edit, "more steps", spec_text.without_row, _STEPS, index)
-            named(button("Remove", remove), f"Remove step {index + 1}")
+            label_widget(button("Remove", remove), f"Remove step {index + 1}")
 
     def _add(self) -> None:
         kind = self.kind

@@ -16,7 +16,7 @@ from orthaug.commands.app.widgets import (
     card,
     choice,
     field,
-    named,
+    label_widget,
     note,
     number,
     redrawn,
@@ -109,7 +109,7 @@ class ModelView:
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
-        with named(
+        with label_widget(
             ui.element("div").classes("entry term").props("role=group"), f"term {index + 1}"
         ):
             with ui.element("div").classes("fields grow"):
@@ -120,7 +120,7 @@ class ModelView:
                     )
                     field(key, term.get(key), change, classes=f"{wide} {key}")
             remove = partial(self.session.edit, "more terms", spec_text.without_row, _TERMS, index)
-            named(button("Remove", remove), f"Remove term {index + 1}")
+            label_widget(button("Remove", remove), f"Remove term {index + 1}")
 
     def _add(self) -> None:
         taken = {
@@ -146,7 +146,7 @@ class ModelView:
             text(f"d{name}/dt = {equation}{learned}", "p", "formula")
         for name, row in spec_text.section(motion, "parameters").items():
             if isinstance(row, Mapping):
-                with named(
+                with label_widget(
                     ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"
                 ):
                     text(name, "p", "strong name")
@@ -180,7 +180,9 @@ class ModelView:
                 choice("learner", _LEARNERS, kind, self._set_kind)
                 if kind == "mlp":
                     hidden = learner.get("hidden", [16])
-                    field("neurons", spec_text.shown(hidden), self._set_hidden, classes="short")
+                    field(
+                        "neurons", spec_text.field_text(hidden), self._set_hidden, classes="short"
+                    )
                 if kind == "terms":
                     field(
                         "highest degree",
@@ -191,7 +193,10 @@ class ModelView:
                 seen = learner.get("inputs")
                 change = self._value("learner", "inputs")
                 field(
-                    "what it sees", spec_text.shown(seen), change, hint="all that the physics reads"
+                    "what it sees",
+                    spec_text.field_text(seen),
+                    change,
+                    hint="all that the physics reads",
                 )
             with ui.element("div").classes("fields"):
                 structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))

@@ -15,8 +15,8 @@ from orthaug.commands.app.widgets import (
     card,
     choice,
     field,
+    label_widget,
     link,
-    named,
     note,
     redrawn,
     text,
@@ -124,7 +124,7 @@ class ExportView:
             bool(session.spec),
             tuple(session.results),
             tuple(session.exports.items()),
-            self._beside(),
+            self._uploaded_files(),
         )
         if state == self._state:
             return
@@ -149,12 +149,12 @@ class ExportView:
             return
         text("The same on the command line:", "p", "small")
         text("orthaug fit spec.toml --out result", "pre")
-        if beside := self._beside():
+        if beside := self._uploaded_files():
             them = "the two" if len(beside) == 1 else "them and the spec"
             named = " and ".join(", ".join(beside).rsplit(", ", 1))
             text(f"The spec names {named}: keep {them} in one folder.", "p", "hint")
 
-    def _beside(self) -> list[str]:
+    def _uploaded_files(self) -> list[str]:
         """Return the files that the spec names without a folder, since they were uploaded."""
         return [file for file in files(self.session.content()) if not Path(file).is_absolute()]
 
@@ -175,7 +175,7 @@ class ExportView:
                 if why == "":
                     made = link(f"{target}.zip", f"/session/{session.key}/get/{target}.zip")
                 else:
-                    made = named(
+                    made = label_widget(
                         button("Write", partial(session.export, target, self.name)),
                         f"Write {target}",
                     )
@@ -186,7 +186,7 @@ class ExportView:
         if re.fullmatch(r"[A-Za-z]\w{0,39}", value.strip(), re.ASCII):
             self.name = value.strip()
             self.session.exports.clear()
-            self.session.changed("work")
+            self.session.mark_changed("work")
         else:
             ui.notify(
                 "A name has letters, digits and underscores, and begins with a letter.",

@@ -139,7 +139,7 @@ class TrainingView:
         elif command.code == 0:
             note(f"{what} is done, in {command.seconds:.1f} s.", "good")
         else:
-            note(f"{what} failed: {self.session.worded(command.complaint)}", "bad")
+            note(f"{what} failed: {self.session.reword(command.complaint)}", "bad")
 
     def _draw_results(self) -> None:
         session = self.session

@@ -21,7 +21,7 @@ _SHORT = 12  # letters that fit on one line
 _WIDE = 5  # columns of a table that may be wider than its place
 
 
-def named(element: Drawn, label: str) -> Drawn:
+def label_widget(element: Drawn, label: str) -> Drawn:
     """Return a widget with its accessible name, which is plain text and never markup."""
     element.props["aria-label"] = label
     return element
@@ -29,10 +29,10 @@ def named(element: Drawn, label: str) -> Drawn:
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     """Return an element with text that is never read as HTML."""
-    return ui.html(_whole(what), sanitize=False, tag=tag).classes(classes)
+    return ui.html(_unbreakable_lags(what), sanitize=False, tag=tag).classes(classes)
 
 
-def _whole(what: Any) -> str:
+def _unbreakable_lags(what: Any) -> str:
     """Return escaped text in which no line breaks at the minus of a lag."""
     return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
 
@@ -46,7 +46,7 @@ def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """Return a section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
     if "sticky" in classes:  # it scrolls by itself, by keys too
-        named(section.props("tabindex=0 role=region"), title)
+        label_widget(section.props("tabindex=0 role=region"), title)
     with section:
         text(title, "h2")
         if hint:
@@ -93,7 +93,7 @@ def choice(
     """Return a native list to choose from, with its label above."""
     with ui.element("label").classes(f"choice {classes}"):
         text(label, "span")
-        made = named(ui.element("select"), label)
+        made = label_widget(ui.element("select"), label)
         with made:
             for key, shown in options.items():
                 option = ui.html(escape(shown), sanitize=False, tag="option")
@@ -120,17 +120,18 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
     ]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        lines.append(f"<tr><th scope='row'>{_whole(row[0])}</th>")
+        lines.append(f"<tr><th scope='row'>{_unbreakable_lags(row[0])}</th>")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
             lines.append(
-                f"<td class='{kind}' data-label='{escape(name, True)}'>{_whole(value)}</td>"
+                f"<td class='{kind}' data-label='{escape(name, True)}'>"
+                f"{_unbreakable_lags(value)}</td>"
             )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
     made.classes("cards" if len(head) > 2 else "")
     if len(head) >= _WIDE:  # it may scroll, by keys too
-        named(made.props("tabindex=0 role=region"), caption or head[0])
+        label_widget(made.props("tabindex=0 role=region"), caption or head[0])
 
 
 def number(value: Any, digits: int = 5) -> str:
@@ -174,7 +175,10 @@ def curves_figure(
     """
     traces: list[dict[str, Any]] = []
     layout = _layout(70 + 130 * len(rows))
-    layout["xaxis"] |= {"title": _small(unit), "anchor": f"y{len(rows)}" if len(rows) > 1 else "y"}
+    layout["xaxis"] |= {
+        "title": _compact_layout(unit),
+        "anchor": f"y{len(rows)}" if len(rows) > 1 else "y",
+    }
     gap = 0.12 / max(len(rows), 1)
     for i, (label, drawn) in enumerate(rows):
         axis, top = (f"y{i + 1}" if i else "y"), 1 - i / len(rows)
@@ -184,7 +188,7 @@ def curves_figure(
                 "zeroline": False,
                 "automargin": True,
             },
-            **{"title": _small(label), "nticks": 5, "anchor": "x"},
+            **{"title": _compact_layout(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
             raw = curve.get("raw", False)
@@ -240,7 +244,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
     entries = list(dict.fromkeys(groups[run] for run in sorted(runs)))
     shown = 1 < len(entries) <= _MOST_ENTRIES
     layout = _layout(260 + _ENTRY * len(entries) * shown)
-    layout["xaxis"] |= {"title": _small("iteration")}
+    layout["xaxis"] |= {"title": _compact_layout("iteration")}
     layout |= {
         "hovermode": "closest",
         "legend": {"yref": "container", "y": 0, "yanchor": "bottom", "x": 0, "tracegroupgap": 0},
@@ -248,7 +252,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
     layout["margin"]["b"] += _ENTRY * len(entries) * shown
     layout["yaxis"] = {
         "type": "log",
-        "title": _small("loss"),
+        "title": _compact_layout("loss"),
         "automargin": True,
         "exponentformat": "e",
         "nticks": 5,
@@ -281,7 +285,7 @@ def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, An
 _CONFIG = {"displayModeBar": False, "responsive": False, "displaylogo": False}
 
 
-def _small(title: str) -> dict[str, Any]:
+def _compact_layout(title: str) -> dict[str, Any]:
     return {"text": title, "font": {"size": 12}}
 
 
@@ -304,4 +308,4 @@ def _layout(height: int) -> dict[str, Any]:
 
 def plot(figure: dict[str, Any], label: str) -> ui.plotly:
     """Return a figure with a text for screen readers."""
-    return named(ui.plotly(figure).classes("plot").props("role=img"), label)
+    return label_widget(ui.plotly(figure).classes("plot").props("role=img"), label)

@@ -65,8 +65,8 @@ def _answer(given: dict[str, Any]) -> dict[str, Any]:
         return {"refused": str(error)}
     except MemoryError:
         return {
-            "refused": "there is not enough memory to look at these data; take fewer rows, or every "
-            "n-th."
+            "refused": "there is not enough memory to look at these data; take fewer rows, or "
+            "every n-th."
         }
     except OSError as error:
         return {
@@ -160,7 +160,7 @@ def _curves(found: Survey) -> dict[str, Any]:
         time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
         if time is None or len(time) < len(values) or not np.isfinite(time).all():
             time = step * np.arange(len(values))
-        curves[column.header] = thinned(time, values)
+        curves[column.header] = thin_curve(time, values)
     return curves
 
 
@@ -179,8 +179,8 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             from orthaug._base.jax import use_compilation_cache
 
             use_compilation_cache()
-        result = kind_of(job).checked(job)
-        refused = kind_of(job).refused(job, result)
+        result = kind_of(job).check(job)
+        refused = kind_of(job).refusal(job, result)
         bias = [
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()
@@ -243,7 +243,9 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
         for e in record.experiments:
             values = np.hstack([e.inputs, e.outputs])[:, j]
             share = max(8, MOST * len(e) // max(len(record), 1))
-            curve = thinned(e.start_time + record.sampling_time * np.arange(len(e)), values, share)
+            curve = thin_curve(
+                e.start_time + record.sampling_time * np.arange(len(e)), values, share
+            )
             x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
         curves[channel.name] = {
             "x": x[:-1],
@@ -254,7 +256,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
     return curves
 
 
-def thinned(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
+def thin_curve(time: Vector, values: Vector, most: int = MOST) -> dict[str, list[float | None]]:
     """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:

@@ -113,7 +113,7 @@ class Settings:
     progress: RunProgress = quiet
     kept: CheckpointWriter | None = None
 
-    def prepared(self, w: Any) -> tuple[Options, Any, State | None]:
+    def prepare(self, w: Any) -> tuple[Options, Any, State | None]:
         """Return the numbers of the compiled program, the initial ridge, and the first state."""
         groups = self.groups
         if (
@@ -135,11 +135,11 @@ class Settings:
         """Return whether there is a step to take."""
         if int(state.code) != Ending.RUNNING:
             return False
-        return not self.limit.reached(
+        return not self.limit.is_past(
             int(state.iteration), float(state.mark), float(state.normal.loss)
         )
 
-    def marked(self, state: State) -> State:
+    def mark(self, state: State) -> State:
         """Return the state, with its loss noted where a window of the limit begins."""
         begins = self.limit.begins_window(int(state.iteration))
         return state._replace(mark=np.asarray(state.normal.loss)) if begins else state
@@ -154,7 +154,7 @@ class Settings:
             self.kept.keep(state, ended=int(state.code) != Ending.RUNNING)
         return False
 
-    def ended(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
+    def end_run(self, state: State, seconds: float, *, enough: bool = False) -> TrainingRun:
         """Return the run from its last state; with `enough`, a listener ended it."""
         held: Any = (
             np.asarray(state.ridge)
@@ -188,9 +188,11 @@ def minimise(
         criterion: hashable; `(w, *arguments, overlap) -> Normal`.
         overlap: a first guess of the learner's share in the physics; zeros do.
     """
-    options, start, state = settings.prepared(w)
+    options, start, state = settings.prepare(w)
     state = (
-        _begun(w, linearise(criterion, w, arguments, overlap), start) if state is None else state
+        _first_state(w, linearise(criterion, w, arguments, overlap), start)
+        if state is None
+        else state
     )
     if settings.runs(state):  # a run beside this one may be compiling: no time of this one
         jax.block_until_ready(_advance(criterion, state, arguments, options, np.int64(0)))
@@ -202,13 +204,13 @@ def minimise(
         state = jax.block_until_ready(
             _advance(criterion, state, arguments, options, np.int64(stop))
         )
-        state = settings.marked(state)
+        state = settings.mark(state)
         burst = burst_length(burst, training_clock() - tick)
         enough = settings.report(state)
-    return settings.ended(state, training_clock() - began, enough=enough)
+    return settings.end_run(state, training_clock() - began, enough=enough)
 
 
-def driven(
+def minimise_by_engine(
     normal_at: Callable[[Any, Overlap], Normal],
     w: Float[Array, "nw"],
     overlap: Overlap,
@@ -221,11 +223,11 @@ def driven(
     Args:
         normal_at: the criterion at weights, with the overlap of the pass before.
     """
-    options, start, state = settings.prepared(w)
+    options, start, state = settings.prepare(w)
     first = normal_at(w, overlap) if state is None else None  # compiles: no time of the run
     began = training_clock()
     if first is not None:
-        state = _begun(
+        state = _first_state(
             w, normal_at(w, first.overlap), start
         )  # less what rounding left of J in the physics
     assert state is not None
@@ -233,9 +235,9 @@ def driven(
     while settings.runs(state) and not enough:
         step = _propose(state)
         state = _judge(state, step, normal_at(state.w + step, state.normal.overlap), options)
-        state = settings.marked(state)
+        state = settings.mark(state)
         enough = settings.report(state)
-    return settings.ended(state, training_clock() - began, enough=enough)
+    return settings.end_run(state, training_clock() - began, enough=enough)
 
 
 def burst_length(burst: int, spent: float) -> int:
@@ -244,7 +246,7 @@ def burst_length(burst: int, spent: float) -> int:
 
 
 @jax.jit
-def _begun(w: Any, normal: Normal, ridge: Any) -> State:
+def _first_state(w: Any, normal: Normal, ridge: Any) -> State:
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
     return State(
@@ -257,7 +259,7 @@ def _begun(w: Any, normal: Normal, ridge: Any) -> State:
         accepted=jnp.asarray(0),
         small=jnp.asarray(0),
         code=jnp.where(
-            finite, jnp.where(spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE
+            finite, jnp.where(is_spanned(normal), Ending.SPANNED, Ending.RUNNING), Ending.NON_FINITE
         ),
         mark=normal.loss,
     )
@@ -395,7 +397,7 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
     return jnp.sum(jnp.where(values > floor, values / (values + alpha), 0.0))
 
 
-def spanned(normal: Normal) -> Any:
+def is_spanned(normal: Normal) -> Any:
     """Return whether P⊥J = 0: the learner lies in the span of the physics (Example 1)."""
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     return curvature <= _NOTHING_LEFT * _largest_column(normal)

@@ -223,7 +223,7 @@ def descend(
             point.loss,
         )
         ending, done, taken, begun, mark = Ending.RUNNING, 0, 1, not evidence_settled, first_loss
-    while ending is Ending.RUNNING and not limit.reached(done, mark, iterate.point.loss):
+    while ending is Ending.RUNNING and not limit.is_past(done, mark, iterate.point.loss):
         iterate, ending = _trial(objective, iterate, limits, tolerance, damping, ceiling)
         if evidence and not begun:
             lower = iterate.point.loss < LEARNED * first_loss or iterate.small > 0
@@ -269,12 +269,12 @@ def descend(
 
 def _pause(objective: Any, iterate: _Iterate, counts: _Counts, ending: Ending) -> Pause:
     own = (iterate.ridge, iterate.damping, iterate.growth, iterate.small)
-    held = (objective.kept(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
+    held = (objective.values_of(iterate.point), *own, np.stack(iterate.path), iterate.coloured)
     return Pause(*held, np.array(counts, dtype=float), int(ending))
 
 
 def _resume(objective: Any, paused: Pause) -> tuple[_Iterate, _Counts, Ending]:
-    point = objective.again(paused.point)
+    point = objective.trial_of(paused.point)
     ridge, damping, growth = (float(paused[i]) for i in (1, 2, 3))
     path, done = tuple(paused.path), paused.counts.tolist()
     iterate = _Iterate(
@@ -321,7 +321,7 @@ def _trial(
     iterate = iterate._replace(damping=iterate.damping * iterate.growth, growth=2 * iterate.growth)
     largest = 1.0 if damping.diagonal else float(np.diag(linear.hessian).max(initial=1e-300))
     if iterate.damping > damping.largest * largest or not step.any():
-        level = _level(linear.hessian, downhill, before, _held(p, downhill, *limits))
+        level = _level(linear.hessian, downhill, before, _bound_mask(p, downhill, *limits))
         return iterate, Ending.CONVERGED if len(iterate.path) > 1 or level else Ending.NO_DESCENT
     return iterate, Ending.RUNNING
 
@@ -366,7 +366,7 @@ def _step(
 
     The quadratic model predicts it.
     """
-    free = np.flatnonzero(~_held(p, downhill, *bounds))
+    free = np.flatnonzero(~_bound_mask(p, downhill, *bounds))
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
@@ -388,7 +388,7 @@ def _step(
     return step, float(2 * step @ downhill - step @ hessian @ step)
 
 
-def _held(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
+def _bound_mask(p: Vector, downhill: Vector, lower: Vector, upper: Vector) -> Bool[np.ndarray, "n"]:
     """Return a mask of the entries at a bound that the descent would leave."""
     return ((p <= lower) & (downhill < 0)) | ((p >= upper) & (downhill > 0))
 

@@ -91,8 +91,8 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """Minimise the same pass by pass, for rows elsewhere; see `compiled.driven`."""
-        return compiled.driven(normal_at, w, overlap, self._settings(**options))
+        """Minimise the same pass by pass, for rows elsewhere; see `compiled.minimise_by_engine`."""
+        return compiled.minimise_by_engine(normal_at, w, overlap, self._settings(**options))
 
     def descend(
         self,

@@ -35,7 +35,7 @@ class Limit(NamedTuple):
         """Number of last steps over which the fall of the loss is judged."""
         return max(self.iterations // 4, min(_FEWEST, self.iterations), 1)
 
-    def reached(self, done: int, before: float, loss: float) -> bool:
+    def is_past(self, done: int, before: float, loss: float) -> bool:
         """Return whether a run ends after `done` steps.
 
         Args:
