@@ -152,9 +152,11 @@ class SuspectedBias:
         def by_name(values: tuple[float | None, ...] | None) -> dict[str, float | None] | None:
             return None if values is None else dict(zip(self.names, values, strict=True))
 
+        memory = self.suspect.memory
         return {
             "name": self.suspect.name,
             "expression": self.suspect.expression,
+            "memory": None if memory is None else memory.name,
             "output": self.suspect.output,
             "coefficient": self.suspect.coefficient,
             "bias": by_name(self.bias),

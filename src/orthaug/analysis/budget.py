@@ -61,6 +61,8 @@ def _by_inputs(
 ) -> Iterator[str]:
     """Yield the choice of learner inputs that frees most of the parameters."""
     problem, suspect = linearization.problem, cause.suspect
+    if suspect.memory is not None:  # a function of the past is one of no inputs of one row
+        return
     layout, x = problem.layout, problem.rows.x
     now = {str(entry) for entry in problem.features.entries}
     best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())

@@ -265,6 +265,8 @@ def design_input(
             "a design needs physics that is made of terms, with one parameter or more."
         )
     theta = _numbers(baseline.initial if theta is None else theta, (len(baseline.names),), "theta")
+    for suspect in suspects:
+        check_no_memory(suspect)
     known = [suspect.sampled(sampling_time) for suspect in suspects]
     plant = Plant(
         baseline.sampled(sampling_time), (tuple(outputs), tuple(inputs)), known, theta, channel
@@ -275,6 +277,15 @@ def design_input(
     return search_input(
         plant, limits, sampling_time, samples, noise, bool(suspects), weights, (seed, iterations)
     )
+
+
+def check_no_memory(suspect: Any) -> None:
+    """Raise InputError for a suspect with memory, of lagged physics or of a motion."""
+    if suspect.memory is not None:
+        raise InputError(
+            f"suspect '{suspect.name}' has memory, which a design does not count. Leave it out of "
+            "the spec of the design."
+        )
 
 
 def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, samples: int) -> None:

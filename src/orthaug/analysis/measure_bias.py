@@ -62,7 +62,7 @@ class MeasureLinearization:
         problem, x = self.problem, self.weighed.points.x
         suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects]
         with np.errstate(all="ignore"):
-            deltas = suspect_columns(suspects, x, problem.layout, problem.outputs)
+            deltas = suspect_columns(suspects, x, problem.layout, problem.outputs, self.lengths)
         kept = [i for i in range(len(suspects)) if every or np.any(deltas[i])]
         chosen = [suspects[i] for i in kept]
         return bias_table(
@@ -79,10 +79,22 @@ class MeasureLinearization:
             absorbed=None if self.directions is None else self._absorbed_effects(chosen),
         )
 
+    @cached_property
+    def lengths(self) -> tuple[int, ...] | None:
+        """Rows of each experiment, where the points are the training rows; else None."""
+        problem = self.problem
+        return problem.lengths if self.weighed.points.x is problem.rows.x else None
+
+    def values(self, suspect: Suspect) -> Matrix:
+        """Return δ (M, ny) of a suspect at the measure's points."""
+        problem = self.problem
+        own = (self.weighed.points.x, problem.layout, problem.outputs, self.lengths)
+        return suspect.sampled(problem.record.sampling_time).values(*own)
+
     def without(self, entry: SuspectedBias) -> MeasureLinearization:
         """Return the linearization less the part of the learner that a suspect explains."""
         held = (
-            entry.suspect.values(self.weighed.points.x, self.problem.layout, self.problem.outputs)
+            self.values(entry.suspect)
             if self.directions is None
             else self._absorbed_effects([entry.suspect])[0].held
         )
@@ -94,13 +106,21 @@ class MeasureLinearization:
         problem = self.problem
         layout, outputs = problem.layout, problem.outputs
 
+        static = [suspect for suspect in suspects if suspect.memory is None]
+
         def forms(x: Matrix) -> Matrix:
-            return np.stack([suspect.form(x, layout) for suspect in suspects], axis=-1)
+            return np.stack([suspect.form(x, layout) for suspect in static], axis=-1)
 
         def term(suspect: Suspect) -> Callable[[Matrix], Matrix]:
-            return lambda x: suspect.values(x, layout, outputs)
+            if suspect.memory is None:
+                return lambda x: suspect.values(x, layout, outputs)
+            along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
+            return lambda x: along[:: -(-len(along) // len(x))]  # on all rows, or every so many
 
-        visible = seen_columns(problem.features, layout, problem.rows.x, forms) if suspects else ()
+        of_static = iter(
+            seen_columns(problem.features, layout, problem.rows.x, forms) if static else ()
+        )
+        visible = [suspect.memory is None and bool(next(of_static)) for suspect in suspects]
         return term_effects(problem, map(term, suspects), visible, self.weighed.points.x)
 
 
@@ -127,7 +147,7 @@ def bias_under(
     )
     found = []
     for entry in table:
-        delta = entry.suspect.values(points.x, problem.layout, problem.outputs)
+        delta = linearization.values(entry.suspect)
         own = {
             "relative_physical_bias": _relative(entry, linearization.slopes),
             "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),

@@ -42,6 +42,10 @@ class MemoryTerm:
         symbol, unit = ("time constant", " s") if self.kind == "lag" else ("width", "")
         return f"{WORDS[self.kind]} of {self.on}, {symbol} {self.scale:.3g}{unit}"
 
+    def along(self, values: Vector, sampling_time: float) -> Vector:
+        """Return the internal state along a signal (N,), as `filter_signal`."""
+        return filter_signal(self, values, sampling_time)
+
 
 def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
     """Return the terms of every kind on a signal, with their grids of time constants and widths."""

@@ -309,7 +309,7 @@ class MotionLinearization:
         """Return the term (M, nl) in the learned equations, 0 where it acts elsewhere."""
         learned = learned_places(self.motion)
         rows = np.zeros((len(self.field.x), len(learned)))
-        if place in learned:
+        if place in learned and suspect.memory is None:
             p = self.motion.coordinates.physical(self.q)
             rows[:, learned.index(place)] = suspect.values(
                 self.motion, p, self.field.x, self.field.u
@@ -332,7 +332,8 @@ class MotionLinearization:
 
     def sees(self, suspect: MotionSuspect) -> bool:
         """Return whether the term acts where the learner does, and is a function of its inputs."""
-        if suspect.place(self.motion) not in learned_places(self.motion):
+        hidden = suspect.memory is not None  # a function of the past is none of one sample
+        if hidden or suspect.place(self.motion) not in learned_places(self.motion):
             return False
         start, end = self._moves
         p, nx = self.motion.coordinates.physical(self.q), len(self.motion.states)

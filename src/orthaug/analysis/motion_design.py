@@ -17,7 +17,14 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_choice, check_number
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax
-from orthaug.analysis.design import Design, check_samples, input_limits, search_input, set_known
+from orthaug.analysis.design import (
+    Design,
+    check_no_memory,
+    check_samples,
+    input_limits,
+    search_input,
+    set_known,
+)
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
@@ -57,6 +64,7 @@ class MotionPlant:
             else check_choice(channel, motion.inputs, "`channel`")
         )
         for suspect in suspects:
+            check_no_memory(suspect)
             if suspect.coefficient is None:
                 raise InputError(
                     f"suspect '{suspect.name}' has no `coefficient`; a design needs a guess of "

@@ -15,6 +15,7 @@ the coarse steps; what finer ones change in it acts on the residual, which hardl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -31,7 +32,7 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.segmented_motion import SegmentedMotion
-from orthaug.fitting.segments import respond, sensitivity
+from orthaug.fitting.segments import Segments, respond, sensitivity
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
@@ -78,6 +79,8 @@ class TermsResponse:
     slope: Any
     fitted: Bool[np.ndarray, "n"]
     terms: int
+    segments: Segments
+    """Those of the place, with the signals of terms with memory."""
 
     @property
     def parameters(self) -> int:
@@ -167,7 +170,7 @@ class TermsResponse:
         place, objective = self.place, self.place.segmented.objective()
         missed = np.moveaxis(np.asarray(place.segmented.segments.start) - place.states, -1, 1)
         prior = LOOSER**2 * objective.start_rows.T @ objective.start_rows
-        made = (self.form, self.numbers, place.segmented.segments, place.states, place.weight)
+        made = (self.form, self.numbers, self.segments, place.states, place.weight)
         return FreeRunScores(*made, 1.0, self.slope, missed @ prior)
 
     def _remaining_information(self, k: int) -> tuple[Vector, float]:
@@ -182,7 +185,8 @@ class TermsResponse:
 
 def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsResponse:
     """Linearise a free run with further terms, and with all that its learner could hold."""
-    segmented, motion = place.segmented, place.segmented.problem.motion
+    motion = place.segmented.problem.motion
+    segmented = place.segmented.with_signals(_signals(place, added))
     suspected = SuspectedMotion.of(motion, added)
     bound, w = segmented.bound, place.w
     if bound is not None and not len(w):
@@ -197,7 +201,23 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
     low, high = motion.coordinates.bounds
     inside = (low < place.c) & (place.c < high)
     fitted = np.concatenate([inside, np.zeros(len(added), dtype=bool), np.ones(len(w), dtype=bool)])
-    return TermsResponse(place, form, numbers, information, gradient, slope, fitted, len(added))
+    own = (information, gradient, slope, fitted, len(added), segmented.segments)
+    return TermsResponse(place, form, numbers, *own)
+
+
+def _signals(place: FreeRunPoint, added: Sequence[SuspectedTerm]) -> list[Matrix]:
+    """Return the signals of terms with memory along every experiment, (N, ns)."""
+    signals = [term.signal for term in added if term.signal is not None]
+    if not signals:
+        return []
+    segmented, motion = place.segmented, place.segmented.problem.motion
+    p, step = motion.coordinates.physical(place.c), segmented.record.sampling_time
+    states = segmented.states_by_row(place.c, place.w, place.states)
+    inputs = [np.asarray(experiment.inputs) for experiment in segmented.record.experiments]
+    return [
+        np.stack([signal.along(motion, p, x, u, step) for signal in signals], axis=1)
+        for x, u in zip(states, inputs, strict=True)
+    ]
 
 
 def solve_scaled(matrix: Matrix, right: Vector) -> Vector:

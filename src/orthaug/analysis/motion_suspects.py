@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +20,16 @@ from orthaug.analysis.suspects import (
     changes_sign,
     check_coefficient,
     check_name,
+    memory_of,
     suspect_text,
 )
 from orthaug.data.expressions import Expression, parse_named
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
-from orthaug.physics.suspected_motion import SuspectedTerm
+from orthaug.physics.suspected_motion import Signal, SuspectedTerm
+
+if TYPE_CHECKING:
+    from orthaug.analysis.memory import MemoryTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
 _WIDTHS = (
@@ -61,6 +66,10 @@ class MotionSuspect:
     unit: str = ""
     jump: str | None = None
     """What changes its sign where the expression jumps, of the kind `coulomb`."""
+    memory: MemoryTerm | None = None
+    """What the expression drives along the run; the term is `factor` times its internal state."""
+    factor: str | None = None
+    """Of a term with memory; of another it is part of the expression."""
 
     output = None  # in the words of lagged suspects
 
@@ -76,6 +85,7 @@ class MotionSuspect:
         on: str | None = None,
         *,
         width: float | None = None,
+        time_constant: float | None = None,
         factor: str | None = None,
         equation: str | None = None,
         coefficient: float | None = None,
@@ -87,16 +97,22 @@ class MotionSuspect:
         Args:
             on: an expression of states, inputs, parameters and definitions, such as `"v"`.
             width: in the unit of `on`.
+            time_constant: of a lag, in s.
             factor: an expression that multiplies the kind's.
 
         Raises:
             InputError: an unknown kind, an argument that is missing, or that the kind does not
                 take.
         """
-        text, label, _ = suspect_text(kind, on, width, _check_parentheses, "v")
+        text, label, _ = suspect_text(kind, on, width, _check_parentheses, "v", time_constant)
+        memory = memory_of(kind, on, width, time_constant)
         if factor is not None:
             _check_parentheses(factor)
-            text, label = f"({factor})*({text})", f"{factor} * {label}"
+            label = f"{factor} * {label}"
+            text = text if memory is not None else f"({factor})*({text})"
+        if memory is not None:
+            own = (label if name is None else name, text, equation, coefficient, unit)
+            return cls(*own, memory=memory, factor=factor)
         jump = " ".join(on.split()) if kind == "coulomb" and on is not None else None
         return cls(label if name is None else name, text, equation, coefficient, unit, jump)
 
@@ -130,11 +146,22 @@ class MotionSuspect:
         return likely[0]
 
     def term(self, motion: Motion) -> SuspectedTerm:
-        """Return the suspect as a term of the motion."""
-        return SuspectedTerm(self.name, self.place(motion), self.parsed(motion))
+        """Return the suspect as a term of the motion.
+
+        Raises:
+            InputError: as `parsed` and `place`.
+        """
+        parsed = self.parsed(motion)
+        if self.memory is None:
+            return SuspectedTerm(self.name, self.place(motion), parsed)
+        factor = parse_named(self.factor or "1", motion.known, f"suspect '{self.name}'")
+        return SuspectedTerm(self.name, self.place(motion), factor, Signal(parsed, self.memory))
 
     def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
-        """Return the expression (M,) at states (M, nx) and inputs (M, nu), finite or not."""
+        """Return the expression (M,) at states (M, nx) and inputs (M, nu), finite or not.
+
+        Of a term with memory it is what drives the memory.
+        """
         with np.errstate(all="ignore"):
             found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
         return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,12 +19,16 @@ from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, pa
 from orthaug.data.regressors import Layout
 from orthaug.physics.problem import Problem
 
+if TYPE_CHECKING:
+    from orthaug.analysis.memory import MemoryTerm
+
 
 class _Kind(NamedTuple):
     """Expression of a kind: `text(x, w)` of the channel expression x and the width w."""
 
     text: Callable[[str, str], str]
     width: bool = False
+    memory: bool = False
 
 
 def _clip(x: str, w: str) -> str:
@@ -43,9 +47,14 @@ _KINDS = {
     "saturation": _Kind(_clip, width=True),
     "offset": _Kind(lambda x, w: "1"),
     "expression": _Kind(lambda x, w: x),
+    "lag": _Kind(lambda x, w: x, memory=True),
+    "backlash": _Kind(lambda x, w: x, width=True, memory=True),
+    "lugre": _Kind(lambda x, w: x, width=True, memory=True),
+    "bouc_wen": _Kind(lambda x, w: x, width=True, memory=True),
 }
 KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
+WITH_MEMORY = tuple(kind for kind, entry in _KINDS.items() if entry.memory)
 ODD_JUMPS = (
     "coulomb",
     "stribeck",
@@ -74,7 +83,8 @@ class Suspect:
     `expression` is in the language of `orthaug.data.expressions` and may use the names in
     `constants` (kept as sorted pairs), and `Ts` for the sampling time. `coefficient` is a guess of
     its size, in the output's unit per unit of the expression, None where there is none. `output`
-    may be left out where there is only one. `on` is what a known kind acts on.
+    may be left out where there is only one. `on` is what a known kind acts on. With `memory` the
+    term is the internal state of that memory, driven by the expression along the record.
 
     Raises:
         InputError: an expression that is not arithmetic on lagged channels, a name or a number that
@@ -93,6 +103,7 @@ class Suspect:
     coefficient: float | None = None
     constants: Mapping[str, float] | tuple[tuple[str, float], ...] = ()
     on: str | None = None
+    memory: MemoryTerm | None = None
 
     def __post_init__(self) -> None:
         check_name(self.name)
@@ -113,6 +124,7 @@ class Suspect:
         on: str | None = None,
         *,
         width: float | None = None,
+        time_constant: float | None = None,
         output: str | None = None,
         coefficient: float | None = None,
         name: str | None = None,
@@ -132,11 +144,16 @@ class Suspect:
         | `saturation` | clip(x, −width, width) | the limit |
         | `offset` | 1, no `on` | |
         | `expression` | x itself | |
+        | `lag` | x behind a first-order lag | |
+        | `backlash` | play `z⁺ = min(max(z, x − width), x + width)` | half of the gap |
+        | `lugre` | bristle `z⁺ = z + d − abs(d) z/width`, d the step of x | largest z |
+        | `bouc_wen` | hysteresis `z⁺ = z + d − (abs(d) abs(z) z + d z²)/(2 width²)` | largest z |
 
         Args:
             kind: one of `KINDS`.
             on: any expression, such as `"v[k-1]"` or `"(y[k-1] - y[k-2])/Ts"`.
             width: in the unit of x, positive; `data_width` suggests one from data.
+            time_constant: of a lag, in s, positive.
             output, coefficient, constants: as in `Suspect`.
             name: default the kind with its arguments, such as `coulomb(v[k-1])`.
 
@@ -149,9 +166,11 @@ class Suspect:
             '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
         """
         text, label, on = suspect_text(
-            kind, on, width, lambda text: parse(text, constants), "v[k-1]"
+            kind, on, width, lambda text: parse(text, constants), "v[k-1]", time_constant
         )
-        return cls(label if name is None else name, text, output, coefficient, constants or (), on)
+        memory = memory_of(kind, on, width, time_constant)
+        own = (label if name is None else name, text, output, coefficient)
+        return cls(*own, constants or (), on, memory)
 
     @property
     def parsed(self) -> Expression:
@@ -162,8 +181,9 @@ class Suspect:
             raise InputError(f"suspect '{self.name}': {error}") from None
 
     def sampled(self, sampling_time: float) -> Suspect:
-        """Return the suspect with this value [s] of `Ts`, if its expression reads it undeclared."""
-        if not self.parsed.unsampled:
+        """Return the suspect with this value [s] of `Ts`, if it needs it and has none."""
+        known = SAMPLING_TIME in dict(self.constants)
+        if not self.parsed.unsampled and (self.memory is None or known):
             return self
         return replace(
             self, constants=(*dict(self.constants).items(), (SAMPLING_TIME, float(sampling_time)))
@@ -174,7 +194,13 @@ class Suspect:
         """The raw lags that it reads."""
         return self.parsed.lags
 
-    def values(self, x: Matrix, layout: Layout, outputs: Sequence[str]) -> Matrix:
+    def values(
+        self,
+        x: Matrix,
+        layout: Layout,
+        outputs: Sequence[str],
+        lengths: Sequence[int] | None = None,
+    ) -> Matrix:
         """Return δ(x) (N, ny) for a coefficient of 1: the expression in its output's column.
 
         Other columns are zero.
@@ -182,12 +208,14 @@ class Suspect:
         Args:
             x: regressors (N, nx) in the order of `layout`.
             outputs: names of the ny outputs.
+            lengths: rows of each experiment, where x are the rows of a record one after the other;
+                a term with memory needs them.
 
         Raises:
             InputError: lags that the layout lacks, an output that is missing or unknown, a value
-                that is not finite.
+                that is not finite, a term with memory on points that are no record.
         """
-        values, column = np.zeros((len(x), len(outputs))), self.form(x, layout)
+        values, column = np.zeros((len(x), len(outputs))), self.form(x, layout, lengths)
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
             raise InputError(
@@ -197,10 +225,27 @@ class Suspect:
         values[:, self.column_of(outputs)] = column
         return values
 
-    def form(self, x: Matrix, layout: Layout) -> Vector:
-        """Return the expression on rows of the regressor (N,), also where it is not finite."""
+    def form(self, x: Matrix, layout: Layout, lengths: Sequence[int] | None = None) -> Vector:
+        """Return the term on rows of the regressor (N,), also where it is not finite.
+
+        Args:
+            x, layout, lengths: as `values`.
+
+        Raises:
+            InputError: lags that the layout lacks, a term with memory on points that are no record.
+        """
         with np.errstate(all="ignore"):
-            return _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
+            found = _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
+        if self.memory is None:
+            return found
+        if lengths is None:
+            raise InputError(
+                f"suspect '{self.name}' has memory: it has values along a record only. Use the "
+                "training measure, or leave it out."
+            )
+        step = dict(self.constants)[SAMPLING_TIME]
+        parts = np.split(found, np.cumsum(lengths)[:-1])
+        return np.concatenate([self.memory.along(part, step) for part in parts])
 
     def column_of(self, outputs: Sequence[str]) -> int:
         known = ", ".join(outputs)
@@ -230,14 +275,36 @@ def check_coefficient(suspect: str, coefficient: Any) -> None:
         )
 
 
+def memory_of(
+    kind: str, on: str | None, width: float | None, time_constant: float | None
+) -> MemoryTerm | None:
+    """Return the memory of a kind, None of a kind without one.
+
+    Arguments are those of `suspect_text`.
+    """
+    if kind not in WITH_MEMORY:
+        return None
+    from orthaug.analysis.memory import MemoryTerm  # it imports scipy.signal
+
+    scale = time_constant if kind == "lag" else width
+    assert on is not None and scale is not None, "`suspect_text` has checked them"
+    return MemoryTerm(kind, on, float(scale))
+
+
 def suspect_text(
-    kind: str, on: str | None, width: float | None, read: Callable[[str], Any], example: str
+    kind: str,
+    on: str | None,
+    width: float | None,
+    read: Callable[[str], Any],
+    example: str,
+    time_constant: float | None = None,
 ) -> tuple[str, str, str | None]:
     """Return expression and label of a known kind, and its variable in plain spaces.
 
     Args:
         read: raises for what is no expression.
         example: of what a kind may act on.
+        time_constant: of a lag, in s.
 
     Raises:
         InputError: an unknown kind, an argument that is missing, or that the kind does not take.
@@ -262,24 +329,37 @@ def suspect_text(
         )
     if width is not None and not _KINDS[kind].width:
         raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
+    if kind == "lag" and time_constant is None:
+        raise InputError("a suspect of kind lag needs `time_constant`, in s.")
+    if kind != "lag" and time_constant is not None:
+        raise InputError(
+            f"a suspect of kind {kind} takes no `time_constant`; got {time_constant!r}."
+        )
     w = "" if width is None else repr(check_number(width, "width", positive=True))
     text = _KINDS[kind].text(on or "", w)
+    if time_constant is not None:
+        w = f"{check_number(time_constant, 'time_constant', positive=True)!r} s"
     arguments = ", ".join(part for part in (on, w) if part)
     return text, text if kind == "expression" else f"{kind}({arguments})" if arguments else kind, on
 
 
 def suspect_columns(
-    suspects: Sequence[Suspect], x: Matrix, layout: Layout, outputs: Sequence[str]
+    suspects: Sequence[Suspect],
+    x: Matrix,
+    layout: Layout,
+    outputs: Sequence[str],
+    lengths: Sequence[int] | None = None,
 ) -> Float[np.ndarray, "ns N ny"]:
     """Return δ(x) of every suspect for a coefficient of 1, (ns, N, ny).
 
-    The unit is that of the output per unit of the coefficient.
+    The unit is that of the output per unit of the coefficient. Arguments are those of
+    `Suspect.values`.
 
     Raises:
         InputError: two suspects of one name; as `Suspect.values`.
     """
     check_unique((suspect.name for suspect in suspects), "suspect")
-    columns = [suspect.values(x, layout, outputs) for suspect in suspects]
+    columns = [suspect.values(x, layout, outputs, lengths) for suspect in suspects]
     return np.stack(columns) if columns else np.zeros((0, len(x), len(outputs)))
 
 

@@ -113,6 +113,8 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
     left = _residual_columns(fit) if plain else None
     found = []
     for entry in result.bias or ():
+        if entry.memory is not None:  # no expression of one row is that term
+            continue
         share, size = entry.explained, entry.coefficient_found
         if entry.residual is not None:
             share, size = entry.residual.share, entry.residual.coefficient

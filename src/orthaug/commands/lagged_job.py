@@ -224,7 +224,7 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         }
         named |= {"problem": problem, "weighed": weighed, "engine": engine}
         job = LaggedJob(**named, physics=physics, left_out=left_out)
-        check_suspects(spec.suspects, problem)
+        check_suspects(spec.suspects, problem, weighed)
         for part in job.parts:
             part.check_scorable(problem.rows.start, train.record.sampling_time)
             if part is not train:  # `pose` has looked at that

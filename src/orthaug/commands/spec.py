@@ -105,6 +105,7 @@ class SuspectSection(Section):
     kind: str = "expression"
     on: str | None = None
     width: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    time_constant: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     output: str | None = None
     coefficient: Finite | None = None
     name: str | None = None

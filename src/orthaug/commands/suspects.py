@@ -8,6 +8,7 @@ from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspect
 from orthaug.analysis.suspects import WIDTHS, Suspect, data_width, suspect_columns
 from orthaug.commands.spec import SuspectSection
 from orthaug.data.expressions import SAMPLING_TIME
+from orthaug.inference.measures import WeighedPhysics
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.problem import Problem
 
@@ -30,6 +31,7 @@ def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tu
         output = section.output if section.output is not None else only
         options = {
             "width": width,
+            "time_constant": section.time_constant,
             "output": output,
             "coefficient": section.coefficient,
             "name": section.name,
@@ -38,11 +40,18 @@ def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tu
     return tuple(suspects)
 
 
-def check_suspects(sections: Sequence[SuspectSection], problem: Problem) -> None:
-    """Raise InputError for suspects that cannot be read, or have no value on some training row."""
-    suspect_columns(
-        declare_suspects(sections, problem), problem.rows.x, problem.layout, problem.outputs
-    )
+def check_suspects(
+    sections: Sequence[SuspectSection], problem: Problem, weighed: WeighedPhysics
+) -> None:
+    """Raise InputError for suspects that cannot be read or have no value.
+
+    They need one on every training row, and one with memory at the points of the measure.
+    """
+    suspects = declare_suspects(sections, problem)
+    suspect_columns(suspects, problem.rows.x, problem.layout, problem.outputs, problem.lengths)
+    if weighed.points.x is not problem.rows.x:
+        hidden = [suspect for suspect in suspects if suspect.memory is not None]
+        suspect_columns(hidden, weighed.points.x[:1], problem.layout, problem.outputs)
 
 
 def declared_terms(
@@ -56,7 +65,7 @@ def declared_terms(
     """
     suspects, (x, u) = [], problem.guessed_points
     for section in sections:
-        kept = ("factor", "equation", "coefficient", "unit", "name")
+        kept = ("time_constant", "factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}
         width = _width(section, lambda on: motion_width(on, problem.motion, x.T, u.T))
         suspects.append(MotionSuspect.of(section.kind, section.on, width=width, **options))

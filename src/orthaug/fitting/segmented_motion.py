@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -115,15 +116,36 @@ class SegmentedMotion(SegmentedProblem):
             dynamics.motion.hold != "spline"
         ):  # otherwise steps read the input at the points of the substeps
             return finer
-        layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
+        return finer._built_anew()
+
+    def with_signals(self, signals: Sequence[Matrix]) -> SegmentedMotion:
+        """Return the problem with signals (N, ns) of every experiment as further inputs."""
+        if not signals:
+            return self
+        longest = max(len(channel.name) for channel in (*self.record.inputs, *self.record.outputs))
+        names = tuple(f"s{'_' * longest}{i}" for i in range(signals[0].shape[1]))  # no channel's
+        pairs = zip(self.record.experiments, signals, strict=True)
+        record = replace(
+            self.record,
+            inputs=(*self.record.inputs, *names),
+            experiments=tuple(
+                replace(part, inputs=np.concatenate([part.inputs, own], axis=1))
+                for part, own in pairs
+            ),
+        )
+        return replace(self, record=record)._built_anew()
+
+    def _built_anew(self) -> SegmentedMotion:
+        """Return the problem with its segments cut anew, from the same starts."""
+        layout = Layout.of(self.record, self.dynamics, self.criterion, self, self.shares)
         segments = (
             layout.segments
             if self.free_run == self.criterion.free_run
-            else finer.over(self.free_run.steps).segments
+            else self.over(self.free_run.steps).segments
         )
         start = np.asarray(self.segments.start)
         return replace(
-            finer, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour
+            self, segments=segments._replace(start=start), whole=layout.whole, colour=layout.colour
         )
 
     def from_states(self, states: Float[np.ndarray, "k n0 m"]) -> SegmentedMotion:

@@ -117,6 +117,11 @@ class Problem:
         )
 
     @property
+    def lengths(self) -> tuple[int, ...]:
+        """Rows of each experiment."""
+        return tuple(len(part) - self.rows.start for part in self.record.experiments)
+
+    @property
     def outputs(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.record.outputs)
 

@@ -4,27 +4,66 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.expressions import Expression
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
 
+class Memory(Protocol):
+    """Internal state that a signal drives."""
+
+    def along(self, values: Vector, sampling_time: float) -> Vector:
+        """Return the internal state along the values (N,) of one experiment, from rest."""
+        ...
+
+
+class Signal(NamedTuple):
+    """Internal state of a memory that an expression drives along the nominal run."""
+
+    expression: Expression
+    memory: Memory
+
+    def along(
+        self, motion: Motion, p: Vector, x: Matrix, u: Matrix, sampling_time: float
+    ) -> Vector:
+        """Return the signal over the samples (N,) of one experiment: each is the mean over it.
+
+        Args:
+            p: parameters (np,).
+            x: states (N, nx) at the samples, with inputs u (N, nu).
+        """
+        with np.errstate(all="ignore"):
+            found = self.expression.value(motion.values(x.T, u.T, p, np), np)
+        state = self.memory.along(np.broadcast_to(np.asarray(found, float), len(x)), sampling_time)
+        if motion.integrator == "discrete":
+            return state
+        return (state + np.append(state[1:], state[-1])) / 2
+
+
 class SuspectedTerm(NamedTuple):
     """A term of an equation, counted from 0 with the outputs after the states.
 
-    `name` is that of its coefficient.
+    `name` is that of its coefficient. A term with a `signal` is the expression times the signal,
+    an input of its own: to first order in the coefficient it is that of the run without the term.
     """
 
     name: str
     place: int
     expression: Expression
+    signal: Signal | None = None
 
 
 @dataclass(frozen=True)
 class SuspectedMotion(Motion):
-    """The motion `physics` with `added` terms, whose coefficients are parameters, 0 at first."""
+    """The motion `physics` with `added` terms, whose coefficients are parameters, 0 at first.
+
+    The signals of terms with memory are inputs after its own.
+    """
 
     physics: Motion | None = None
     added: tuple[SuspectedTerm, ...] = ()
@@ -37,19 +76,21 @@ class SuspectedMotion(Motion):
             *physics.parameters,
             *(PhysicalParameter(term.name, 0.0) for term in added),
         )
+        signals = tuple(f"signal of {term.name}" for term in added if term.signal is not None)
+        own["inputs"] = (*physics.inputs, *signals)
         return cls(**own, physics=physics, added=tuple(added))
 
     def values(
         self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
     ) -> dict[str, Any]:
-        return self._known.values(x, u, p[: self._count], xp, needed)
+        return self._known.values(x, u[: self._own], p[: self._count], xp, needed)
 
     def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        rates = self._known.rates(x, u, p[: self._count], xp)
+        rates = self._known.rates(x, u[: self._own], p[: self._count], xp)
         return self._with_terms(rates, 0, (x, u, p), xp)
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
-        outputs = self._known.observed(x, u, p[: self._count], xp)
+        outputs = self._known.observed(x, u[: self._own], p[: self._count], xp)
         return self._with_terms(outputs, len(self.states), (x, u, p), xp)
 
     @property
@@ -61,17 +102,23 @@ class SuspectedMotion(Motion):
     def _count(self) -> int:
         return len(self._known.parameters)
 
+    @property
+    def _own(self) -> int:
+        """Number of inputs of the physics."""
+        return len(self._known.inputs)
+
     def _with_terms(self, rows: Any, first: int, at: tuple[Any, Any, Any], xp: Any) -> Any:
         """Return the rows with their terms added; the first row is that of the place `first`."""
         x, u, p = at
         found = list(rows)
-        values = None
+        values, signals = None, iter(u[self._own :])
         for term, coefficient in zip(self.added, p[self._count :], strict=True):
+            signal = 1.0 if term.signal is None else next(signals)
             if first <= term.place < first + len(found):
                 values = self.values(x, u, p, xp) if values is None else values
                 found[term.place - first] = found[
                     term.place - first
-                ] + coefficient * term.expression.value(values, xp)
+                ] + coefficient * signal * term.expression.value(values, xp)
         return (
             rows
             if values is None

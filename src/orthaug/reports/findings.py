@@ -101,7 +101,7 @@ class ResidualStepResult(Content):
 class SuspectResult(Content):
     """The change of θ by a term that may be missing."""
 
-    absent = frozenset({"equation", "unit", "residual"})
+    absent = frozenset({"equation", "unit", "residual", "memory"})
 
     name: str
     expression: str
@@ -123,6 +123,8 @@ class SuspectResult(Content):
     equation: str | None = None
     unit: str | None = None
     residual: ResidualStepResult | None = None
+    memory: str | None = None
+    """What the expression drives, in words; None of a term without memory."""
 
     @property
     def percent(self) -> dict[str, float | None]:
