@@ -100,7 +100,8 @@ class Imitation:
         ]
         if self.determined:
             sentences.append(
-                f"The data determine {_list_words(self.determined)} with any learner of these inputs."
+                f"The data determine {_list_words(self.determined)} "
+                "with any learner of these inputs."
             )
         if self.physical:
             sentences.append(
