@@ -44,6 +44,7 @@ _CENTRES = (
     0.95,
 )  # quantiles about which a function of a learner's feature bends
 _STATIC = 5
+_MULTIPLIED = 8  # features, of which products of pairs are taken
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
@@ -291,7 +292,8 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
     They are starts, parameters, and functions of the learner's inputs.
     """
     features = [_features(model, run) for run in runs]
-    bends = _bends(np.concatenate(features))
+    of_terms = bool(getattr(model.form.features, "linear", False))
+    functions = np.asarray if of_terms else _bends(np.concatenate(features))
     places = [i for i, _ in _equations(model)]
     if isinstance(model, MotionModel):
         places = list(model.form.motion.learned[0])
@@ -300,13 +302,19 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
         starts = run.starts()
         own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
         own[..., j * starts.shape[2] : (j + 1) * starts.shape[2]] = starts
-        learned = [_respond(model, run, place, bends(z)) for place in places] if z.shape[1] else []
+        learned = (
+            [_respond(model, run, place, functions(z)) for place in places] if z.shape[1] else []
+        )
         found.append(np.concatenate([run.parameters(), own, *learned], axis=2))
     return found
 
 
 def _bends(z: Matrix):
-    """Return a flexible function of features: their bends at quantiles, and products of pairs."""
+    """Return a flexible function of features: their bends at quantiles, and products of pairs.
+
+    Products are those of the first `_MULTIPLIED` features: all pairs of many would be more columns
+    than rows.
+    """
     centre, size = z.mean(axis=0), np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
     scaled = (z - centre) / size
     knots = [np.unique(np.quantile(column, _CENTRES)) for column in scaled.T]
@@ -320,7 +328,7 @@ def _bends(z: Matrix):
                 v**3,
                 *(np.tanh((v - knot) / width) for knot in at for width in (0.05, 0.4)),
             ]
-        for i in range(own.shape[1]):
+        for i in range(min(own.shape[1], _MULTIPLIED)):
             for j in range(i):
                 found += [
                     own[:, i] * own[:, j],
