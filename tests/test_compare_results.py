@@ -49,7 +49,7 @@ CHANGED = [
         {"parameters": [{"name": "a", "value": 2.0, "std": 0.0}]},
         "parameters[0].std: None, then 0.0",
     ),
-    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: only in one of them"),
+    ({"parameters": [{"name": "a", "value": 2.0}]}, "parameters[0].std: None, then absent"),
     ({"text": "at experiment 0, run.csv: line 6"}, "text: "),
     ({"warnings": [{"code": "poor", "text": "the model is good"}]}, "warnings[0]: "),
     ({"orthogonality_defect": 1e-9}, "orthogonality_defect: "),

@@ -474,7 +474,7 @@ def test_a_second_run_reads_the_store(found, store, monkeypatch):
     (first,) = (one for one in found if one.entry.name == "static_errors")
     study = first.entry.study("ours", True)
     monkeypatch.setattr(
-        "orthaug.studies.static_errors.trained", lambda *a, **k: pytest.fail("it ran again")
+        "orthaug.studies.static_errors.train", lambda *a, **k: pytest.fail("it ran again")
     )
     again = run(study, store=store)
     assert again.test_rmse.tolist() == first.table.test_rmse.tolist()

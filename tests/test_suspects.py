@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from orthaug import Baseline, InputError, Record, Suspect, Term, estimate, synthetic
-from orthaug.analysis.suspects import KINDS, data_width, suspect_columns, usual_suspects
+from orthaug.analysis.suspects import (
+    KINDS,
+    WITH_MEMORY,
+    data_width,
+    suspect_columns,
+    usual_suspects,
+)
 
 LAYOUT = Suspect("all", "y[k-1] + y[k-2] + u[k-1]").lags
 X = np.random.default_rng(1).normal(size=(50, 3)) * [0.005, 0.005, 100.0]
@@ -46,7 +52,8 @@ def test_values_of_every_kind(kind):
 
 
 def test_every_kind_is_tested():
-    assert set(KINDS) == {*FORMS, "offset"}
+    """Those with memory in test_memory_suspects."""
+    assert set(KINDS) == {*FORMS, "offset", *WITH_MEMORY}
 
 
 def test_offset():

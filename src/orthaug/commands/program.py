@@ -68,7 +68,7 @@ def _repeat_options(args: Sequence[str], lists: Set[str], valued: Set[str]) -> l
 
     Examples:
         >>> given = ["run.csv", "--inputs", "a", "b", "--out", "c"]
-        >>> _repeated(given, {"--inputs"}, {"--inputs", "--out"})
+        >>> _repeat_options(given, {"--inputs"}, {"--inputs", "--out"})
         ['run.csv', '--inputs', 'a', '--inputs', 'b', '--out', 'c']
     """
     found: list[list[str]] = []

@@ -260,7 +260,7 @@ def thin_curve(time: Vector, values: Vector, most: int = MOST) -> dict[str, list
     """Return a curve of at most about `most` points: minimum and maximum of each stretch, in order.
 
     Examples:
-        >>> thinned(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
+        >>> thin_curve(np.arange(6.0), np.array([0.0, 5.0, 1.0, 2.0, -1.0, 0.0]), 4)
         {'x': [0.0, 1.0, 3.0, 4.0], 'y': [0.0, 5.0, 2.0, -1.0]}
     """
     if len(values) > most:
