@@ -61,7 +61,6 @@ CONCEPTS = {
     "analysis.inconsistency": "a test of one-step θ",
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",
-    "analysis.memory": "the catalogue of terms with memory",
     "analysis.missing_lags": "a test of lags",
     "analysis.motion_design": "experiments for a motion",
     "analysis.motion_identifiability": "identifiability before training",

@@ -16,10 +16,10 @@ import orthaug.fitting.segments as laid
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Numbers
-from orthaug.models.integrators import inputs_at_points
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
+from orthaug.physics.integrators import inputs_at_points
 from orthaug.physics.motion_problem import guess
 
 TS = 0.05

@@ -277,7 +277,7 @@ def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Ma
         into_output[:, place] = columns
         if n0:
             into_state[:, place] = columns
-    elif model.form.motion.integrator == "discrete":
+    elif model.form.motion.scheme.discrete:
         into_state[:, place] = columns
     else:
         half = model.sampling_time / 2

@@ -82,7 +82,7 @@ def try_holds(
     task = on_longest(problem, criterion, solver, structure, learner)
     motion, free_fit = problem.motion, task.physics
     found = [_declared_trial(task.plan, free_fit, declared=True)]
-    several = motion.integrator != "discrete" and bool(motion.inputs) and free_fit is not None
+    several = not motion.scheme.discrete and bool(motion.inputs) and free_fit is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
             found.append(_try_hold(hold, task, solver))

@@ -89,7 +89,7 @@ class MotionStep:
 
     @property
     def continuous(self) -> bool:
-        return self.form.motion.integrator != "discrete"
+        return not self.form.motion.scheme.discrete
 
     @property
     def ends(self) -> int:

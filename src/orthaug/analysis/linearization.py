@@ -258,7 +258,7 @@ def _smooth(model: Model | MotionModel) -> bool:
     """Return whether inputs run on a spline between samples."""
     if not isinstance(model, MotionModel) or not model.inputs:
         return False
-    return model.form.motion.hold == "spline" and model.form.motion.integrator != "discrete"
+    return model.form.motion.hold == "spline" and not model.form.motion.scheme.discrete
 
 
 def _without_next(system: System) -> System:

@@ -143,7 +143,7 @@ def _propagate(
         now, then = added[:, :, k].T, added[:, :, min(k + 1, steps - 1)].T  # (m, q)
         for place, i in enumerate(equations):
             to = slice(own + place * q, own + (place + 1) * q)
-            if form.motion.integrator == "discrete":
+            if form.motion.scheme.discrete:
                 slope[:, i, to] += now
                 continue
             slope[:, :, to] += h / 2 * a[:, :, i, None] * now[:, None]

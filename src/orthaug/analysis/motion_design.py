@@ -28,8 +28,8 @@ from orthaug.analysis.design import (
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
-from orthaug.models.integrators import inputs_at_points
 from orthaug.models.moving import MotionDynamics
+from orthaug.physics.integrators import inputs_at_points
 from orthaug.physics.motion import Motion
 from orthaug.physics.suspected_motion import SuspectedMotion
 

@@ -162,7 +162,7 @@ def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
     if not kept.any():
         return None
     values = np.linalg.eigvals(slopes[kept])
-    if model.form.motion.integrator == "discrete":
+    if model.form.motion.scheme.discrete:
         small = np.abs(values) < 1e-300  # gone in one sample
         values = np.log(np.where(small, 1e-300, values).astype(complex)) / model.sampling_time
     size = np.abs(values)

@@ -276,7 +276,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
     slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
     if (
-        motion.integrator == "discrete"
+        motion.scheme.discrete
         or fit.scores is None
         or slope is None
         or 2 * substeps > MOST_SUBSTEPS

@@ -197,7 +197,7 @@ def _term(
         if equation is None:
             return
         places = declared["motion"]["states"]
-        key = "next" if spec.motion.integrator == "discrete" else "derivative"
+        key = "next" if spec.motion.discrete else "derivative"
         own = str(places[equation][key])
         if f"*{_squeeze(expression)}" in _squeeze(own):
             return
@@ -363,7 +363,7 @@ def _reads(inputs: tuple[str, ...], variable: str) -> bool:
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
     """Yield the holds of the inputs that a motion does not use yet."""
     motion = job.spec.motion
-    if motion is None or not job.spec.data.inputs or motion.integrator == "discrete":
+    if motion is None or not job.spec.data.inputs or motion.discrete:
         return
     if result.residuals is None or result.residuals.verdict != "unmodelled":
         return
@@ -506,7 +506,7 @@ def advise(
     learns = fit.model.form.bound is not None
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     motion = result.motion
-    substeps = None if motion is None or motion.integrator == "discrete" else motion.substeps
+    substeps = None if motion is None or motion.discrete else motion.substeps
     trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
     base = trials.run(trials.changed_job({}), variant)
     if base is None:

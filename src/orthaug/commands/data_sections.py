@@ -23,7 +23,8 @@ from orthaug.commands.sections import (
 )
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
-from orthaug.physics.motion import HOLDS, INTEGRATORS, MOST_SUBSTEPS, Motion, Output, State
+from orthaug.physics.integrators import INTEGRATORS
+from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion, Output, State
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine
@@ -188,10 +189,11 @@ class OutputSection(Section):
     learned: bool = False
 
 
-class MotionSection(Section):
+class MotionSection(KindSection):
     """Equations of motion: states, outputs, parameters, and how they are integrated."""
 
-    integrator: Literal[INTEGRATORS] = "rk4"  # type: ignore[valid-type]
+    registries = {"integrator": INTEGRATORS}
+    integrator: str = "rk4"
     substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"
     hold: Literal[HOLDS] = "zero-order"  # type: ignore[valid-type]
     states: Annotated[dict[str, StateSection], Field(min_length=1)]
@@ -203,7 +205,7 @@ class MotionSection(Section):
     @model_validator(mode="after")
     def _check_equations(self) -> MotionSection:
         """Check that each state has the equation that its integrator reads."""
-        discrete = self.integrator == "discrete"
+        discrete = self.discrete
         own, other = ("next", "derivative") if discrete else ("derivative", "next")
         kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
         for name, state in self.states.items():
@@ -214,6 +216,11 @@ class MotionSection(Section):
         return self
 
     @property
+    def discrete(self) -> bool:
+        """True if the equations give the next state."""
+        return bool(INTEGRATORS[self.integrator].discrete)
+
+    @property
     def learns(self) -> bool:
         """True if a learner is added to any equation or output."""
         outputs = (
@@ -221,7 +228,7 @@ class MotionSection(Section):
         )
         return any(state.learned for state in self.states.values()) or any(outputs)
 
-    def declared(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
+    def motion_of(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
         """Return the motion, with its channels in the order of the data.
 
         Raises:
@@ -238,7 +245,7 @@ class MotionSection(Section):
         ]
         states = []
         for name, state in self.states.items():
-            equation = state.next if self.integrator == "discrete" else state.derivative
+            equation = state.next if self.discrete else state.derivative
             states.append(State(name, str(equation), state.start, state.learned, state.unit))
         return Motion.from_equations(
             states=states,

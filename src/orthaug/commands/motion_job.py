@@ -79,7 +79,7 @@ class MotionJob(Job):
 
     def with_spec(self, spec: Spec) -> MotionJob:
         assert spec.motion is not None
-        motion = spec.motion.declared(spec.data.inputs, spec.data.outputs)
+        motion = spec.motion.motion_of(spec.data.inputs, spec.data.outputs)
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
         problem = pose_motion(self.train.record, motion, inputs, spec.training.output_weights)
         return replace(self, spec=spec, problem=problem, checkpoints=None)
@@ -104,7 +104,7 @@ def open_motion(path: Path, spec: Spec) -> MotionJob:
     assert spec.motion is not None
     try:
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
-        motion = spec.motion.declared(spec.data.inputs, spec.data.outputs)
+        motion = spec.motion.motion_of(spec.data.inputs, spec.data.outputs)
         motion.check_channels(spec.data.inputs, spec.data.outputs)
     except InputError as error:
         raise InputError(f"{path}: motion: {str(error).removeprefix('motion.')}") from None

@@ -321,7 +321,7 @@ def _about_steps(job: MotionJob, trial: Trial) -> tuple[str, list[Warning]]:
     """Return a text on the errors of integrator and hold in the outputs, and warnings."""
     motion, problem, warnings = job.problem.motion, job.problem, []
     step = problem.record.sampling_time
-    if motion.integrator == "discrete":
+    if motion.scheme.discrete:
         return "The equations give the state one sample later: nothing is integrated.", warnings
     if trial.substeps is None:
         sentences = (

@@ -43,6 +43,7 @@ from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_lags, over_states
 from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.parameters import PhysicsMap
 
 Orders = Count | list[Count]
@@ -330,7 +331,7 @@ class Spec(Section):
         if not hasattr(learner, "over"):
             return learner
         if self.motion is not None:
-            return over_states(learner, self.motion.declared(self.data.inputs, self.data.outputs))
+            return over_states(learner, self.motion.motion_of(self.data.inputs, self.data.outputs))
         channels = tuple(self.data.outputs), tuple(self.data.inputs)
         return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
 
@@ -426,7 +427,7 @@ def spec_model() -> type[Spec]:
     return _spec_model(
         tuple(
             tuple(registry.items())
-            for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA)
+            for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA, INTEGRATORS)
         )
     )
 
@@ -441,6 +442,7 @@ def _spec_model(registered: object) -> type[Spec]:
         "training": with_kinds(TrainingSection),
     }
     fields: dict[str, Any] = {name: (section, section()) for name, section in sections.items()}
+    fields["motion"] = (with_kinds(MotionSection) | None, None)
     return create_model("Spec", __base__=Spec, **fields)
 
 

@@ -21,7 +21,7 @@ from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug._base.jax import jax
 from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
-from orthaug.export.program import Program, Signal, Vectors
+from orthaug.export.program import WRITTEN, Program, Signal, Vectors
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
@@ -117,6 +117,11 @@ def export(
     target: Target = TARGETS[to]()
     program = program_of(model, name, storage.digest(model))
     vectors = _vectors_of(model, program)
+    if program.scheme is not None and program.scheme.kind not in WRITTEN:
+        raise InputError(
+            f"the integrator '{program.scheme.kind}' cannot be written as code; known are "
+            f"{', '.join(WRITTEN)}. `model.step` and `oa.numpy_step` take any integrator."
+        )
     files = dict(target.files(program, vectors))
     files |= {
         VECTORS: vectors.csv(program),

@@ -12,9 +12,9 @@ from orthaug._base.errors import InputError
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
-from orthaug.models.integrators import runge_kutta
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
+from orthaug.physics.integrators import INTEGRATORS
 
 Values = dict[str, Any]
 """`x`, `u`, `g` and intermediate results by name."""
@@ -185,7 +185,7 @@ def _advance_function(
     one = (
         _exponential(rate, dict(scheme.matrices))
         if scheme.kind == "exact"
-        else runge_kutta(rate, h)
+        else INTEGRATORS[scheme.kind]().step(rate, h)
     )
 
     def advance(x: Vector, u: Vector) -> Vector:

@@ -79,6 +79,10 @@ class Block:
         return self.network.layers if self.network is not None else ()
 
 
+WRITTEN = ("discrete", "rk4", "exact")
+"""Schemes that targets can write; `numpy_step` takes any."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scheme:
     """Scheme by which a motion advances one sample: `discrete`, `rk4`, or `exact` by matrices.

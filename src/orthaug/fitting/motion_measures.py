@@ -66,7 +66,7 @@ def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
     motion = segmented.problem.motion
     with np.errstate(all="ignore"):
         rates = np.asarray(motion.rates(x.T, u.T, motion.coordinates.physical(c), np), dtype=float)
-    if motion.integrator == "discrete":
+    if motion.scheme.discrete:
         rates = rates - x.T
     states, outputs = motion.learned
     size = np.concatenate(

@@ -141,7 +141,7 @@ def _fine_enough(
     motion = segmented.problem.motion
     while (
         motion.substeps is None
-        and motion.integrator != "discrete"
+        and not motion.scheme.discrete
         and segmented.dynamics.substeps < MOST_SUBSTEPS
     ):
         finer = segmented.with_substeps(2 * segmented.dynamics.substeps)

@@ -168,7 +168,7 @@ def _rates(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
     motion = model.form.motion
     if motion.functions is not None:
         raise InputError("the physics are Python functions, which cannot be written as equations.")
-    discrete = motion.integrator == "discrete"
+    discrete = motion.scheme.discrete
     found = []
     for state in motion.states:
         symbol = latex(Expression(state.name))

@@ -164,7 +164,7 @@ def labels_of(form: MotionField) -> tuple[tuple[str, str], ...]:
     rates = []
     for i in states:
         state = motion.states[i]
-        following = motion.integrator == "discrete"
+        following = motion.scheme.discrete
         unit = state.unit if following else _rate(state.unit)
         rates.append((f"next {state.name}" if following else f"d{state.name}/dt", unit))
     return (*rates, *((motion.outputs[i].name, "") for i in outputs))

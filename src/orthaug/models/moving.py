@@ -15,8 +15,14 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
-from orthaug.models.integrators import UNROLLED, Exponentials, advance, input_at, inputs_at_points
 from orthaug.models.motion_field import MotionField
+from orthaug.physics.integrators import (
+    UNROLLED,
+    Exponentials,
+    advance,
+    input_at,
+    inputs_at_points,
+)
 from orthaug.physics.motion_problem import guess, layout_of
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
@@ -209,28 +215,22 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def _step_once(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         y = self.observed(numbers, state, self.now(inputs))
         parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
-        if self.motion.integrator == "discrete":
+        if self.motion.scheme.discrete:
             return sum(self.rates(numbers, state, self.now(inputs))), parts
 
-        following = advance(
-            partial(_field, self, numbers),
-            self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0],
-            state,
-            inputs,
-            len(self.motion.inputs),
-            self.sampling_time,
-            self.substeps,
-            self.motion.integrator,
-            looped=self._large,
-        )
-        return following, parts
+        exponentials = self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0]
+        h, large = self.sampling_time / self.substeps, self._large
+        field = partial(_field, self, numbers)
+        step = self.motion.scheme.step(field, h, exponentials, looped=large)
+        nu = len(self.motion.inputs)
+        return advance(step, state, inputs, nu, self.substeps, looped=large), parts
 
     def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with the exponentials of an exact integrator.
 
         Their derivatives are by the coordinates of p.
         """
-        if self.motion.integrator != "exact":
+        if not self.motion.scheme.splits_linear_part:
             return numbers
 
         def of(theta: Any) -> Any:
@@ -244,7 +244,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
         None where the integrator needs none.
         """
-        if self.motion.integrator != "exact":
+        if not self.motion.scheme.splits_linear_part:
             return None
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
@@ -255,7 +255,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     @property
     def _by_stages(self) -> bool:
         few = self.substeps <= UNROLLED and not self._large
-        return self.motion.integrator == "rk4" and few and self.differentiable
+        return self.motion.scheme.has_adjoint and few and self.differentiable
 
     def tangents(
         self, numbers: Numbers, state: Any, slopes: Any, inputs: Any

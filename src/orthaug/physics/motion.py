@@ -20,6 +20,7 @@ from orthaug._base.errors import InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.physics.baseline import check_sampling_constant
+from orthaug.physics.integrators import INTEGRATORS, Integrator
 from orthaug.physics.parameters import (
     Coordinates,
     PhysicalParameter,
@@ -27,7 +28,6 @@ from orthaug.physics.parameters import (
     check_parameters,
 )
 
-INTEGRATORS = ("rk4", "exact", "discrete")
 HOLDS = ("zero-order", "first-order", "spline")
 MOST_SUBSTEPS = 256
 _DERIVATIVE = "derivative of "
@@ -111,6 +111,11 @@ class Motion(NotebookView):
     functions: tuple[Callable[..., Any], Callable[..., Any]] | None = None
     """f(x, u, p) and h(x, u, p) on JAX arrays, instead of expressions."""
 
+    @property
+    def scheme(self) -> Integrator:
+        """The integrator."""
+        return INTEGRATORS[self.integrator]()
+
     @classmethod
     def from_equations(
         cls,
@@ -133,7 +138,7 @@ class Motion(NotebookView):
             inputs: names of the input channels, in the record's order.
             define: names for longer expressions.
             integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix
-                exponential), or "discrete".
+                exponential), "discrete", or another of `INTEGRATORS`.
             substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the
                 data.
             hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight)
@@ -167,7 +172,7 @@ class Motion(NotebookView):
         motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
         for state in plain.states:
             if state.derivative is None:
-                what = "next" if integrator == "discrete" else "derivative"
+                what = "next" if plain.scheme.discrete else "derivative"
                 raise InputError(f"the state '{state.name}' has no `{what}`; give its equation.")
             parse_named(state.derivative, everything, f"the equation of '{state.name}'")
         for output in plain.outputs:
@@ -233,7 +238,7 @@ class Motion(NotebookView):
                 f"`substeps` must be a whole number from 1 to {MOST_SUBSTEPS}; got "
                 f"{show(substeps)}."
             )
-        if integrator == "discrete" and hold != "zero-order":
+        if INTEGRATORS[integrator].discrete and hold != "zero-order":
             raise InputError("a discrete motion has no input between samples; leave `hold` out.")
         if not states:
             raise InputError("the motion has no states; give at least one with its equation.")

@@ -24,9 +24,6 @@ from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
-_ANGLE = (
-    0.35  # of the fastest mode in a substep [rad]: Runge-Kutta errs by about 1e-3 of it in a period
-)
 _TURNED = (
     100.0  # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
 )
@@ -147,13 +144,11 @@ class MotionProblem:
     def substeps(self) -> int:
         """Substeps per sample with which training begins."""
         motion = self.motion
-        if motion.integrator == "discrete":
+        if motion.scheme.discrete:
             return 1
         if motion.substeps is not None:
             return motion.substeps
-        if motion.integrator == "exact":
-            return 1
-        return max(1, int(np.ceil(self.fastest * self.record.sampling_time / _ANGLE)))
+        return motion.scheme.first_substeps(self.fastest * self.record.sampling_time)
 
 
 def pose_motion(
@@ -229,14 +224,14 @@ def _check_start(problem: MotionProblem) -> None:
     motion, where = problem.motion, problem.without_value(np.all)
     if where:
         raise InputError(f"{where}; correct it, or change the initial values.")
-    if motion.integrator == "rk4" and problem.substeps > MOST_SUBSTEPS:
+    if motion.scheme.widest_angle is not None and problem.substeps > MOST_SUBSTEPS:
         raise InputError(
             f"the sampling time of {problem.record.sampling_time:g} s is too long for the "
             f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
             f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
             '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
         )
-    if motion.integrator == "exact":
+    if motion.scheme.splits_linear_part:
         _check_exact(problem)
 
 

@@ -40,7 +40,7 @@ class Signal(NamedTuple):
         with np.errstate(all="ignore"):
             found = self.expression.value(motion.values(x.T, u.T, p, np), np)
         state = self.memory.along(np.broadcast_to(np.asarray(found, float), len(x)), sampling_time)
-        if motion.integrator == "discrete":
+        if motion.scheme.discrete:
             return state
         return (state + np.append(state[1:], state[-1])) / 2
 

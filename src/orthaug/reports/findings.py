@@ -403,3 +403,8 @@ class MotionFitResult(Content):
     window: Whole
     parts: list[EquationPartsResult] = []
     substep_bias: ByName | None = None
+
+    @property
+    def discrete(self) -> bool:
+        """True if the equations give the next state, and nothing was integrated."""
+        return self.integrator == "discrete"

@@ -203,7 +203,7 @@ def _equations(result: FitResult) -> list[Any]:
     blocks: list[Any] = []
     declared = result.spec.get("motion")
     if result.motion is not None and declared:
-        next_value = result.motion.integrator == "discrete"
+        next_value = result.motion.discrete
         rows = [
             [
                 state,

@@ -190,7 +190,7 @@ def added_to_motion(
         substeps=motion.substeps,
         hold=motion.hold,
     )
-    own = "next" if motion.integrator == "discrete" else "derivative"
+    own = "next" if motion.scheme.discrete else "derivative"
     states = {state.name for state in motion.states}
     places = dict.fromkeys(one.added_to for one in added)
     equations = tuple(

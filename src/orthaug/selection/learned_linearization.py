@@ -235,7 +235,7 @@ class MotionResponse:
     ) -> MotionResponse:
         """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
-        half = 0.0 if form.motion.integrator == "discrete" else form.sampling_time / 2
+        half = 0.0 if form.motion.scheme.discrete else form.sampling_time / 2
         return cls(np.nan_to_num(steps), weight @ np.nan_to_num(outputs), begins, weight, half)
 
     def forward(self, terms: Float[np.ndarray, "M n k"]) -> Float[np.ndarray, "R k"]:

@@ -9,18 +9,22 @@ several substeps in a sample.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax, jnp
+from orthaug._base.registry import Registry
 
 UNROLLED = 4  # substeps; more run as a loop, which compiles faster
 _SQUARINGS, _TERMS = 12, 12  # of the matrix exponential
 
 Field = Callable[[Any, Any], Any]
 """F(x (nx,), u (nu,)) → (nx,)."""
+Step = Callable[[Any, Any, Any, Any], Any]
+"""x one substep later, of x and the inputs at its begin, middle and end."""
 
 
 def inputs_at_points(inputs: Matrix, hold: str, substeps: int) -> Matrix:
@@ -80,44 +84,95 @@ class Exponentials(NamedTuple):
         return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
 
 
-def advance(
-    field: Field,
-    scheme: Any,
-    x: Any,
-    row: Any,
-    nu: int,
-    step: float,
-    substeps: int,
-    integrator: str,
-    *,
-    looped: bool = False,
-) -> Any:
+@dataclass(frozen=True)
+class Integrator:
+    """How a motion goes on by one substep; a new one is a subclass in `INTEGRATORS`.
+
+    Arithmetic alone, so that the arrays may be JAX's or NumPy's. Derivatives are automatic.
+    """
+
+    discrete: ClassVar[bool] = False
+    """Whether the equations give the next state, and nothing is integrated."""
+    widest_angle: ClassVar[float | None] = 0.1
+    """|λ| h of the fastest mode λ in the substeps h that training begins with; None for any."""
+    splits_linear_part: ClassVar[bool] = False
+    """Whether a step needs the `Exponentials` of the part that is linear at the origin."""
+    has_adjoint: ClassVar[bool] = False
+    """Whether `models.moving` has hand-written slopes of its stages."""
+
+    def step(self, field: Field, h: float, scheme: Any = None, *, looped: bool = False) -> Step:
+        """Return a step of length h.
+
+        Args:
+            field: ẋ = F(x, u).
+            h: the substep.
+            scheme: the `Exponentials` of the linear part, where it splits that.
+            looped: write the field once into a program where that is possible.
+        """
+        raise NotImplementedError
+
+    def first_substeps(self, angle: float) -> int:
+        """Return the substeps that training begins with, of the fastest mode's |λ| Ts."""
+        return 1 if self.widest_angle is None else max(1, int(np.ceil(angle / self.widest_angle)))
+
+
+@dataclass(frozen=True)
+class RungeKutta4(Integrator):
+    """The classical Runge-Kutta method of order 4."""
+
+    widest_angle = 0.35  # rad: it errs by about 1e-3 of that in a period
+    has_adjoint = True
+
+    def step(self, field: Field, h: float, scheme: Any = None, *, looped: bool = False) -> Step:
+        return _stages_in_a_loop(field, h) if looped else runge_kutta(field, h)
+
+
+@dataclass(frozen=True)
+class Exponential(Integrator):
+    """Exponential time differencing of order 4 (Cox and Matthews 2002)."""
+
+    widest_angle = None
+    splits_linear_part = True
+
+    def step(self, field: Field, h: float, scheme: Any = None, *, looped: bool = False) -> Step:
+        return _exponential(field, scheme, h)
+
+
+@dataclass(frozen=True)
+class Discrete(Integrator):
+    """Equations that give the state one sample later."""
+
+    discrete = True
+    widest_angle = None
+
+
+INTEGRATORS = Registry(
+    "integrator", {"rk4": RungeKutta4, "exact": Exponential, "discrete": Discrete}
+)
+
+
+def advance(step: Step, x: Any, row: Any, nu: int, substeps: int, *, looped: bool = False) -> Any:
     """Return x one sample later.
 
     Args:
-        field: ẋ = F(x, u).
-        scheme: the `Exponentials` of its linear part; None for `rk4`.
+        step: of one substep.
         x: the state.
         row: the input as `inputs_at_points` arranges it.
         nu: number of inputs.
-        step: the sampling time.
         substeps: of a sample.
-        integrator: "rk4" or "exact".
-        looped: write the field once into a program, and not for every stage: a large one compiles
+        looped: write the step once into a program, and not for every substep: a large one compiles
             faster so.
     """
-    at, halves, h = input_at(row, nu), 2 * substeps, step / substeps
-    stages = _stages_in_a_loop if looped else runge_kutta
-    one = _exponential(field, scheme, h) if integrator == "exact" else stages(field, h)
+    at, halves = input_at(row, nu), 2 * substeps
     if substeps <= UNROLLED and not (looped and substeps > 1):
         for j in range(substeps):
-            x = one(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
+            x = step(x, at(2 * j, halves), at(2 * j + 1, halves), at(2 * j + 2, halves))
         return x
     u = jnp.stack([at(i, halves) for i in range(halves + 1)])
-    return jax.lax.scan(lambda x, u: (one(x, *u), None), x, (u[:-2:2], u[1:-1:2], u[2::2]))[0]
+    return jax.lax.scan(lambda x, u: (step(x, *u), None), x, (u[:-2:2], u[1:-1:2], u[2::2]))[0]
 
 
-def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
+def runge_kutta(field: Field, h: float) -> Step:
     """Return a step of length h under inputs at its begin, middle and end.
 
     The arrays may be JAX's or NumPy's.
@@ -133,7 +188,7 @@ def runge_kutta(field: Field, h: float) -> Callable[..., Any]:
     return one
 
 
-def _stages_in_a_loop(field: Field, h: float) -> Callable[..., Any]:
+def _stages_in_a_loop(field: Field, h: float) -> Step:
     """`runge_kutta` of JAX arrays with a loop over the stages."""
     ahead, share = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.array([1.0, 2.0, 2.0, 1.0]) / 6
 
@@ -152,7 +207,7 @@ def _stages_in_a_loop(field: Field, h: float) -> Callable[..., Any]:
     return one
 
 
-def _exponential(field: Field, scheme: Exponentials, h: float) -> Callable[..., Any]:
+def _exponential(field: Field, scheme: Exponentials, h: float) -> Step:
     linear, whole, phi1, phi2, phi3, half, half1 = scheme
 
     def rest(x: Any, u: Any) -> Any:

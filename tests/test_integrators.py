@@ -1,0 +1,160 @@
+"""Integrators: one from outside is a class, and everything that a motion has goes with it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_cli import finite_json, run
+
+import orthaug as oa
+from orthaug.physics.integrators import INTEGRATORS, Integrator
+
+STEP = 0.05  # s
+
+SPEC = """
+[data]
+sampling_time = 0.05
+inputs = ["force"]
+outputs = ["x"]
+train = {{ files = ["a.csv"] }}
+tests.other = {{ files = ["b.csv"], skip = 5 }}
+[motion]
+integrator = "{integrator}"
+{more}
+[motion.states]
+x = {{ derivative = "v", start = "x" }}
+v = {{ derivative = "(force - c*v - k*x)/m", start = 0 }}
+[motion.outputs]
+x = "x"
+[motion.parameters]
+m = {{ initial = 1.2 }}
+c = {{ initial = 0.8 }}
+k = {{ initial = 8.0 }}
+[training]
+segment = 0
+"""
+
+
+@dataclass(frozen=True)
+class SemiImplicitEuler(Integrator):
+    """Each state goes on by the rate at the states after it, which have gone on already."""
+
+    def step(self, field, h, scheme=None, *, looped=False):
+        def one(x, first, middle, last):
+            for i in reversed(range(len(x))):
+                unit = np.eye(len(x))[i]
+                x = x + h * field(x, first) * unit
+            return x
+
+        return one
+
+
+@dataclass(frozen=True)
+class DormandPrince(Integrator):
+    """The solution of order 5 of Dormand and Prince (1980), with fixed steps; inputs are held."""
+
+    widest_angle = 0.6
+
+    TABLEAU = (
+        (),
+        (1 / 5,),
+        (3 / 40, 9 / 40),
+        (44 / 45, -56 / 15, 32 / 9),
+        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    )
+    WEIGHTS = (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)
+
+    def step(self, field, h, scheme=None, *, looped=False):
+        def one(x, first, middle, last):
+            slopes = []
+            for row in self.TABLEAU:
+                at = sum((h * a * k for a, k in zip(row, slopes, strict=True)), x)
+                slopes.append(field(at, first))
+            return sum((h * b * k for b, k in zip(self.WEIGHTS, slopes, strict=True)), x)
+
+        return one
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """The folder of two records of a mass on a spring, under a held force, exact."""
+    monkeypatch.chdir(tmp_path)
+    from scipy.linalg import expm
+
+    a = np.array([[0, 1, 0], [-9, -1, 1], [0, 0, 0]]) * STEP
+    following = expm(a)
+    for name, seed in (("a", 1), ("b", 2)):
+        force = np.repeat(5 * np.random.default_rng(seed).uniform(-1, 1, 20), 10)
+        x, v, found = 0.0, 0.0, []
+        for u in force:
+            found.append(x)
+            x, v, _ = following @ [x, v, u]
+        pd.DataFrame({"force": force, "x": found}).to_csv(f"{name}.csv", index=False)
+    return tmp_path
+
+
+def fitted(integrator: str, more: str = "") -> dict:
+    """Return the result of a fit with an integrator, saved in the folder of its name."""
+    Path("spec.toml").write_text(SPEC.format(integrator=integrator, more=more))
+    assert run("check", "spec.toml", "--json").code == 0
+    done = run("fit", "spec.toml", "--out", integrator, "--force", "--json")
+    assert done.code == 0, done.err
+    return finite_json(done.out)
+
+
+def values(result: dict) -> np.ndarray:
+    """Return the parameters of a result."""
+    return np.array([row["value"] for row in result["parameters"]])
+
+
+def test_one_from_outside_has_all_that_a_motion_has(folder):
+    """Fit, interval, report, saved model, free run and step; of order 1 it errs as its order says."""
+    with INTEGRATORS.with_kind("semi-implicit-euler", SemiImplicitEuler):
+        errors = []
+        for substeps in (8, 16):
+            result = fitted("semi-implicit-euler", f"substeps = {substeps}")
+            errors.append(np.abs(values(result) - [1.0, 1.0, 9.0]))
+        assert result["motion"]["integrator"] == "semi-implicit-euler"
+        np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.2)
+        assert Path("semi-implicit-euler/report.html").exists()
+        simulated = run("simulate", "semi-implicit-euler", "b.csv")
+        assert simulated.code == 0
+        model = oa.load("semi-implicit-euler")
+        step = oa.numpy_step(model)
+        state, inputs = np.array([0.1, -0.2]), np.array([1.5])
+        np.testing.assert_allclose(step(state, inputs)[0], model.step(state, inputs)[0], rtol=1e-12)
+        done = run("export", "semi-implicit-euler", "--to", "c", "--out", "c")
+        assert done.code == 2 and "cannot be written as code" in done.err
+        assert not Path("c").exists()
+
+
+def test_a_higher_order_is_as_exact_as_it_says(folder):
+    """Two steps of order 5 in a sample beside the matrix exponential, which is exact here."""
+    exact = values(fitted("exact"))
+    np.testing.assert_allclose(exact, [1.0, 1.0, 9.0], rtol=1e-6)
+    with INTEGRATORS.with_kind("dormand-prince", DormandPrince):
+        np.testing.assert_allclose(
+            values(fitted("dormand-prince", "substeps = 2")), exact, rtol=1e-6
+        )
+
+
+def test_an_unknown_one_is_refused_with_those_that_are_known(folder):
+    Path("spec.toml").write_text(SPEC.format(integrator="semi-implicit-euler", more=""))
+    done = run("check", "spec.toml")
+    assert done.code == 2
+    assert all(name in done.err for name in ("motion.integrator", "rk4", "exact", "discrete"))
+
+
+def test_a_saved_model_says_which_integrator_it_needs(folder):
+    with INTEGRATORS.with_kind("dormand-prince", DormandPrince):
+        fitted("dormand-prince")
+    kept = json.loads(Path("dormand-prince/model/model.json").read_text())
+    assert kept["motion"]["integrator"] == "dormand-prince"
+    done = run("simulate", "dormand-prince", "b.csv")
+    assert done.code == 2 and "dormand-prince" in done.err and "Traceback" not in done.err
