@@ -23,10 +23,8 @@ from scipy.signal import lfilter
 import orthaug as oa
 from orthaug.inference.covariance import interval
 
-TRUE, TS = (
-    np.array([1.0, 100.0, 1000.0]),
-    0.01,
-)  # m, c, k of the mass-spring-damper, and its sampling time
+# M, c, k of the mass-spring-damper, and its sampling time
+TRUE, TS = (np.array([1.0, 100.0, 1000.0]), 0.01)
 LABELS = (
     "θ1, θ3, training",
     "θ1, θ3, uniform",
@@ -54,9 +52,8 @@ def static(regularization: str | float, ridge: float) -> Callable[[int], list[np
     held_out = example.test.rows(0, 200)
     truth, clean = held_out.experiments[0].outputs, example.train.experiments[0]
     node, weight = np.polynomial.legendre.leggauss(64)
-    measure = oa.Samples(
-        {"u[k]": 0.6 * node}, weight / 2
-    )  # Uniform({"u[k]": (-0.6, 0.6)}) with 64 nodes, not 2¹⁸
+    # Uniform({"u[k]": (-0.6, 0.6)}) with 64 nodes, not 2¹⁸
+    measure = oa.Samples({"u[k]": 0.6 * node}, weight / 2)
 
     def draw(seed: int) -> list[np.ndarray]:
         noise = np.random.default_rng([seed, 1]).normal(

@@ -258,9 +258,8 @@ class Costs(NamedTuple):
 def costs(folder: Path) -> Costs:
     """Measured here, but for a network of 1 GB/s with 1 ms: workers of one machine have none."""
     row = single_threaded(folder) / 1e6
-    part = np.random.default_rng(0).normal(
-        size=(85, 85)
-    )  # 81 weights, the residual and 3 parameters
+    # 81 weights, the residual and 3 parameters
+    part = np.random.default_rng(0).normal(size=(85, 85))
     add = fastest(lambda: [part + part for _ in range(1000)], 3) / 1000
     client = connect(None, 2)
     try:

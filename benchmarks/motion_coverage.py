@@ -26,9 +26,8 @@ TS, ROWS, HELD, FINE = 0.01, 1000, 25, 10
 NOISE = 10**-1.5  # over the output's deviation
 NAMES = ("m", "c", "k")
 DRAWS = 200
-SPEEDS = np.linspace(
-    -4, 4, 17
-)  # m/s, nearly the reach of the data; friction turns over within 0.1 m/s of 0
+# M/s, nearly the reach of the data; friction turns over within 0.1 m/s of 0
+SPEEDS = np.linspace(-4, 4, 17)
 
 
 class Plant(NamedTuple):

@@ -27,10 +27,8 @@ from orthaug.analysis.changes import Change
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.expressions import Lag
 
-FELL, HELPED = (
-    0.01,
-    0.05,
-)  # of the held-out error: a change that helps; one that a verdict of none must not miss
+# Of the held-out error: a change that helps; one that a verdict of none must not miss
+FELL, HELPED = (0.01, 0.05)
 PREDICTION, SIMULATION = oa.Prediction(), oa.Simulation(512, 40)
 SOLVER, SKIP, NEURONS = oa.LevenbergMarquardt(60), 40, 10
 

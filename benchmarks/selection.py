@@ -252,9 +252,8 @@ def coverage(draws: int = 200) -> dict[str, float]:
             chosen = oa.select(record, PHYSICS, lags=LAGS, criterion=oa.Prediction(), halves=halves)
             if chosen.learner is None:
                 continue
-            data = (
-                record if name == "same data" else chosen.record
-            )  # which `chosen.estimate()` gives no intervals
+            # Which `chosen.estimate()` gives no intervals
+            data = record if name == "same data" else chosen.record
             table = oa.estimate(data, PHYSICS, **chosen.options).terms
             for term, row in table.iterrows():
                 true = truth.get(str(term), 0.0)

@@ -112,9 +112,8 @@ class Stacked:
         self.weight = 1 / rows.y.std(axis=0)
         self.raw_phi = fit.problem.baseline.phi(rows.x, rows.layout, fit.problem.outputs, np)
         z = (fit.problem.feature_rows() - numbers.centre) / numbers.halfwidth
-        padded = np.concatenate(
-            [z, np.repeat(z[:1], 64 - len(z), axis=0)]
-        )  # one shape, one compiled program
+        # One shape, one compiled program
+        padded = np.concatenate([z, np.repeat(z[:1], 64 - len(z), axis=0)])
         values = np.asarray(learner_of(bound)(jnp.asarray(numbers.weights), padded))[: len(z)]
         self.raw_f = numbers.gain * values
         self.phi = (self.raw_phi * self.weight[:, None]).reshape(rows.y.size, -1)

@@ -44,11 +44,8 @@ MADE = {  # by functions: nobody writes their arguments
     ),
     *("LinearView", "Linearization", "Selection", "PhysicsMap"),
 }
-DEVELOPERS = (
-    "CONTRIBUTING.md",
-    "docs/design.md",
-    "docs/notation.md",
-)  # their names are the code's, not a spec's
+# Their names are the code's, not a spec's
+DEVELOPERS = ("CONTRIBUTING.md", "docs/design.md", "docs/notation.md")
 
 
 def backticked(text: str) -> list[str]:

@@ -37,10 +37,8 @@ from orthaug.models.streaming import read_ahead
 from orthaug.physics.problem import pose
 from orthaug.physics.streamed import stream_problem
 
-SIZE, ROWS = (
-    53,
-    160,
-)  # 159 rows after the first: three chunks of one size, which share their compiled programs
+# 159 rows after the first: three chunks of one size, which share their compiled programs
+SIZE, ROWS = (53, 160)
 
 
 @dataclass(frozen=True)
@@ -84,9 +82,8 @@ def posed(ny, lower=None):
 
 
 EXACT = LevenbergMarquardt(iterations=400, tolerance=1e-13)
-EARLY = LevenbergMarquardt(
-    iterations=20, tolerance=1e-13
-)  # without a ridge, before rounding has grown
+# Without a ridge, before rounding has grown
+EARLY = LevenbergMarquardt(iterations=20, tolerance=1e-13)
 STRUCTURES = (Orthogonal(), Additive(), OrthogonalPenalty(1.0), BaselinePenalty(1.0))
 REGULARIZATIONS = ("none", 0.1, "evidence")
 CASES = [  # each structure with one and two outputs, each regularisation with each number of outputs

@@ -188,9 +188,8 @@ def test_linear_learner_on_expressions_is_least_squares(record, structure):
     )
     if structure == "orthogonal":
         np.testing.assert_allclose(found.theta, least_squares(a[:, :2], b), rtol=1e-12)
-        beside = estimate(
-            record, PHYSICS, learner=learner, regularization="none"
-        ).theta  # it cannot imitate the physics: a joint regression
+        # It cannot imitate the physics: a joint regression
+        beside = estimate(record, PHYSICS, learner=learner, regularization="none").theta
         np.testing.assert_allclose(beside, least_squares(a, b)[:2], rtol=1e-6)
 
 

@@ -594,9 +594,8 @@ def test_what_an_export_needs_is_named_where_it_is_missing(tmp_path, monkeypatch
     ):
         oa.export(model, tmp_path / "out", "onnx")
     monkeypatch.setattr(fmu, "_target", lambda: ("linux64", ".so"))
-    failing = (
-        [(str(tmp_path / "bin"), "cc failed: no licence")] if os.name == "posix" else []
-    )  # a script is no program
+    # A script is no program
+    failing = [(str(tmp_path / "bin"), "cc failed: no licence")] if os.name == "posix" else []
     for path, words in [("", "no C compiler was found"), *failing]:
         monkeypatch.setenv("PATH", path)
         (tmp_path / "bin").mkdir(exist_ok=True)

@@ -89,9 +89,8 @@ def test_a_fall_back_says_that_a_state_is_missing(tmp_path):
     learner = '[learner]\nhidden = [3]\ninputs = ["v"]\n'
     result, text, page = fitted(tmp_path, MOTION, spring(), learner)
     k = next(row for row in result["parameters"] if row["name"] == "k")
-    said = (
-        k["ci95"] is not None
-    )  # what a missing state leaves may remember itself for too long to have an interval
+    # What a missing state leaves may remember itself for too long to have an interval
+    said = k["ci95"] is not None
     assert (k["ci95_counts"] == "noise only") if said else ("too_long_memory" in codes(result))
     assert {"unexplained", "hidden_state"} <= codes(result)
     assert result["unexplained"]["hidden_state"]

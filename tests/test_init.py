@@ -249,9 +249,8 @@ def test_what_is_seen_of_a_column(tmp_path):
     )  # an input between its steps is at no limit
     assert found.find("square").limits == () and found.find("square").quantum is None
     assert found.find("coarse").quantum == pytest.approx(0.1)
-    slow = 100 * np.sin(
-        np.arange(4000) / 400
-    )  # an encoder: fine beside the range, coarse beside a sample
+    # An encoder: fine beside the range, coarse beside a sample
+    slow = 100 * np.sin(np.arange(4000) / 400)
     noisy = np.round(slow + 2 * rng.normal(size=4000))
     frame = pd.DataFrame({"encoder": np.round(slow), "fine": np.round(slow, 2), "noisy": noisy})
     frame.to_csv(tmp_path / "c.csv", index=False)
@@ -523,9 +522,8 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
     u, y = plant(300)
     data = {"u": u, "y": y} | beside.pop("data", {})
     scipy.io.savemat(tmp_path / "a.mat", {"data": data} | beside)
-    done = run(
-        "init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml"
-    )  # data.u and data.y are known as u and y
+    # Data.u and data.y are known as u and y
+    done = run("init", tmp_path / "a.mat", "--out", tmp_path / "spec.toml")
     assert done.code == 0, done.err
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert (data["inputs"], data["outputs"], data["sampling_time"]) == (

@@ -242,9 +242,8 @@ def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_susp
     assert cause["coefficient_found"] * cause["bias"]["c"] == pytest.approx(
         rows["c"]["bias"]["value"]
     )
-    limits = rows["c"][
-        "ci95_with_bias"
-    ]  # of so short a training the causes that noise cannot tell apart may disagree
+    # Of so short a training the causes that noise cannot tell apart may disagree
+    limits = rows["c"]["ci95_with_bias"]
     assert limits[0] < C < limits[1] if rows["c"]["bias"]["determined"] else limits is None
     assert ("not_determined" in {w["code"] for w in result["warnings"]}) == (limits is None)
     assert cause["name"] in " ".join(printed.split())

@@ -250,9 +250,8 @@ def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     assert [rival.suspect.name[:15] for rival in rivals] == ["coulomb as tanh"] and rivals[
         0
     ] is not beside.cause
-    twice = motion_budget(
-        fit, [beside.cause, replace(table[1], explained=beside.share)]
-    )  # a rival that is elsewhere
+    # A rival that is elsewhere
+    twice = motion_budget(fit, [beside.cause, replace(table[1], explained=beside.share)])
     assert not twice.of("c").determined or twice.of("c").ci95[1] > alone.of("c").ci95[0]
     assert "(close to it: quadratic_drag, " in twice.warnings[0].text
 

@@ -187,9 +187,8 @@ def test_penalties_count_in_the_units_of_the_sum_that_is_asked_for():
     values = learner_values(fit)
     residual = y - phi @ fit.theta - values
     penalised = np.sum(residual**2) + 3.0 * np.sum((q.T @ values.ravel()) ** 2)
-    moved = values + 1e-4 * (q @ (q.T @ values.ravel())).reshape(
-        values.shape
-    )  # along the physics, θ moved against it
+    # Along the physics, θ moved against it
+    moved = values + 1e-4 * (q @ (q.T @ values.ravel())).reshape(values.shape)
     theta = np.linalg.lstsq(phi.reshape(-1, 2), (y - moved).ravel(), rcond=None)[0]
     other = np.sum((y - phi @ theta - moved) ** 2) + 3.0 * np.sum((q.T @ moved.ravel()) ** 2)
     assert penalised <= other * (1 + 1e-9)

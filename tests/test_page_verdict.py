@@ -128,9 +128,8 @@ def test_what_was_tried_comes_first_and_what_was_not_is_an_option():
     better = [AdviceResult(change={"motion.hold": "spline"}, text=text, before=0.2, after=0.1)]
     both = told(LEARNER, LAG)
     assert fit_verdict(fitted(residuals=both, advice=better, advice_trials=tried)).then == text
-    then = fit_verdict(
-        fitted(residuals=both, advice_trials=tried)
-    ).then  # both were tried and did not improve it
+    # Both were tried and did not improve it
+    then = fit_verdict(fitted(residuals=both, advice_trials=tried)).then
     assert (
         then.startswith("None of the changes that were tried improves the free run")
         and "lag" not in then

@@ -268,9 +268,8 @@ def test_the_orthogonal_solution_is_in_the_equivalence_set(further):
     theta = exact.theta + further * error
     values = orthogonal.learner[:, 0] - further * (phi @ error)
     np.testing.assert_allclose(phi @ theta + values, phi @ THETA + delta, atol=1e-9)
-    shown = np.linalg.norm(
-        np.linalg.lstsq(phi, values - delta, rcond=None)[0]
-    )  # eq:baseline_error_simple_augm
+    # Eq:baseline_error_simple_augm
+    shown = np.linalg.norm(np.linalg.lstsq(phi, values - delta, rcond=None)[0])
     assert shown == pytest.approx((1 + further) * np.linalg.norm(error), rel=1e-9)
     assert (shown > (1 + 1e-9) * np.linalg.norm(error)) == (further > 0)
 

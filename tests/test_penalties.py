@@ -21,12 +21,10 @@ from orthaug import (
     synthetic,
 )
 
-PIPELINE = AdamLBFGS(
-    adam_iterations=100, lbfgs_iterations=60
-)  # of the scripts' 2500 and 500: θ stands by then
-LONGER = AdamLBFGS(
-    adam_iterations=300, lbfgs_iterations=150
-)  # where the weight is neither small nor large
+# Of the scripts' 2500 and 500: θ stands by then
+PIPELINE = AdamLBFGS(adam_iterations=100, lbfgs_iterations=60)
+# Where the weight is neither small nor large
+LONGER = AdamLBFGS(adam_iterations=300, lbfgs_iterations=150)
 SHORT = LevenbergMarquardt(iterations=30)
 PENALTIES = (OrthogonalPenalty, BaselinePenalty)
 

@@ -190,9 +190,8 @@ def test_random_invertible_maps(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     root = rng.normal(size=(n, n))
-    a = root @ root.T + np.eye(
-        n
-    )  # with the cubes below the gradient of a strictly convex function: one-to-one
+    # With the cubes below the gradient of a strictly convex function: one-to-one
+    a = root @ root.T + np.eye(n)
     scale = 10.0 ** rng.integers(-4, 5, n)
     texts = {
         f"t{i}": " + ".join(f"{float(a[i, j])!r}*(p{j}/{float(scale[j])!r})" for j in range(n))

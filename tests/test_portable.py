@@ -36,9 +36,8 @@ ONLY_POSIX = {
         "pause",
     ),
 }
-ASKED_FIRST = dict.fromkeys(
-    ("_base.memory", "commands.app.worker"), {"resource"}
-)  # in a `try`, and done without
+# In a `try`, and done without
+ASKED_FIRST = dict.fromkeys(("_base.memory", "commands.app.worker"), {"resource"})
 TEXT = {"read_text": 0, "write_text": 1}  # and how many arguments stand before the encoding
 
 

@@ -176,9 +176,8 @@ def test_curves_hold_the_whole_record_in_finite_numbers(pages, lagged, motion, c
 
 def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
     part = lagged.job.parts[-1].record
-    own = (
-        lagged.fit.model.physics_only.simulate(part).trajectories[0].model
-    )  # of a motion from the same start
+    # Of a motion from the same start
+    own = lagged.fit.model.physics_only.simulate(part).trajectories[0].model
     for kind, fitted, alone in (("lagged", lagged, own), ("motion", motion, None)):
         (run,) = fitted.responses[fitted.job.parts[-1].name][1].trajectories
         alone = run.baseline[:, 0] if alone is None else alone[:, 0]

@@ -22,10 +22,8 @@ from orthaug.analysis.whiteness import (
 from orthaug.reports.residual_tests import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
-BETWEEN = (
-    0.005,
-    0.016,
-)  # of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
+# Of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation
+BETWEEN = (0.005, 0.016)
 
 
 def coloured(white, *a):

@@ -277,9 +277,8 @@ def test_narx_numbers_are_those_of_estimate(narx, records):
 
 def test_rows_of_a_group_need_not_stand_together(narx, records):
     X, y, groups, _ = records
-    order = np.argsort(
-        np.tile(np.arange(60), 4), kind="stable"
-    )  # row 0 of every experiment, row 1 of every one, …
+    # Row 0 of every experiment, row 1 of every one, …
+    order = np.argsort(np.tile(np.arange(60), 4), kind="stable")
     mixed = clone(narx).fit(X[order], y[order], groups[order])
     np.testing.assert_array_equal(mixed.theta_, narx.theta_)
     back = np.empty(len(y))

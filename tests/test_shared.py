@@ -471,9 +471,8 @@ def test_a_computed_column_has_the_papers_projection_and_the_rest_stays_determin
         record, baseline, learner=oa.MLP(hidden=(8,), inputs=("speed[k]", "place[k]"))
     )
     phi = np.column_stack([signals[:, 0], signals[:, 3], np.ones(len(force))])
-    rest = (
-        force - 0.8 * signals[:, 2]
-    )  # the paper's projection on the shared directions, beside the known mass
+    # The paper's projection on the shared directions, beside the known mass
+    rest = force - 0.8 * signals[:, 2]
     expected = np.linalg.lstsq(phi, rest, rcond=None)[0]
     assert fit.theta[[0, 1, 3]] == pytest.approx(expected, abs=0.02)
     low, high = fit.interval[2]

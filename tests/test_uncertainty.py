@@ -38,9 +38,8 @@ from orthaug.inference.covariance import (
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)
-WIDE = Samples(
-    {"u[k]": 0.6 * NODE}, weights=SHARE
-)  # uniform on ±0.6, exact for smooth physics, and quick
+# Uniform on ±0.6, exact for smooth physics, and quick
+WIDE = Samples({"u[k]": 0.6 * NODE}, weights=SHARE)
 QUICK = LevenbergMarquardt(iterations=12)
 EXAMPLE = synthetic.static(1)
 

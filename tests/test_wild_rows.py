@@ -122,9 +122,8 @@ def text_of(result: dict, code: str) -> str:
 def test_a_wild_cell_is_named_before_the_fit_and_its_remedy_works(tmp_path, spec, channel):
     measured(tmp_path, channel)
     (tmp_path / "spec.toml").write_text(spec.format(prepare="", missing=""))
-    done = run(
-        "check", tmp_path / "spec.toml", "--json"
-    )  # of a motion it is refused where its run goes beyond numbers
+    # Of a motion it is refused where its run goes beyond numbers
+    done = run("check", tmp_path / "spec.toml", "--json")
     text = text_of(json.loads(done.out), "wild_samples") if done.code == 0 else done.err
     assert (
         "run.csv" in text

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 
 LONGEST = 60  # characters of a name or value in a message
 _FEW = 4  # entries of an array that is shown
-_MOST, _HEAD = (
-    1200,
-    900,
-)  # characters of a message, and of its beginning where the middle is left out
+# Characters of a message, and of its beginning where the middle is left out
+_MOST, _HEAD = (1200, 900)
 _SEARCHED = 6 * _MOST  # characters that are looked at for names and values
 _QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
 _LISTED = re.compile(r"\[[^][]+\]")

@@ -25,9 +25,8 @@ from orthaug._base.errors import InputError
 
 MANIFEST = "manifest.json"
 _PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
-_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[
-    :8
-]  # of a folder that several machines share
+# Of a folder that several machines share
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 _OF_THE_SYSTEM = {
     ".DS_Store",
     "Thumbs.db",

@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     import jax.numpy as jnp
     from jax import Array
 else:
-    Array = (
-        Any  # in annotations; at run time jaxtyping checks shape and type of whatever is an array
-    )
+    # In annotations; at run time jaxtyping checks shape and type of whatever is an array
+    Array = Any
 
 _LENGTH = hashlib.sha256().digest_size
 __all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]

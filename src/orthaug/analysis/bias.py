@@ -365,9 +365,8 @@ def _certificate_along(projection: Projection, delta: Matrix, directions: Matrix
 def _certificate(
     projection: Projection, a: Vector, cosine: float, margin: Vector, points: int
 ) -> Certificate:
-    direction = projection.from_coordinates(a) * np.sqrt(
-        points
-    )  # ‖Qa‖ = 1, so Φa has root mean square 1
+    # ‖Qa‖ = 1, so Φa has root mean square 1
+    direction = projection.from_coordinates(a) * np.sqrt(points)
     sizes = (
         np.sqrt(np.square(projection.phi * projection.scale).sum(axis=(0, 1))) / projection.scale
     )

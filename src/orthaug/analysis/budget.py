@@ -370,9 +370,8 @@ def _physical_rows(
         )
         shifts = shifts if i else moves
         ends.append(limits)
-    ends = np.stack(
-        [np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1
-    )  # NaN where one has none
+    # NaN where one has none
+    ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)
     owners = _owners(causes, moved @ turned.T) if slopes else []
     rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
     return rows, _unbounded_warnings(physical.names, own, ends)

@@ -21,10 +21,8 @@ from orthaug.models.model import Model
 from orthaug.models.response import Response
 
 _SAMPLES = 2000  # points at most
-_STEEPEST, _ACTIVE = (
-    50,
-    64,
-)  # points of largest radius always among them; worst points that a round of search adds
+# Points of largest radius always among them; worst points that a round of search adds
+_STEEPEST, _ACTIVE = (50, 64)
 _LARGEST_SEARCH = 12  # n0 with a metric better than Lyapunov's
 
 

@@ -132,14 +132,10 @@ def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]
     return waves, squares
 
 
-SEARCH_ROWS, SEARCH_PERIODS = (
-    512,
-    40,
-)  # of the shortened record: samples, or periods of the best square if more
-STARTS, FINALISTS = (
-    6,
-    12,
-)  # patterns that are improved, each of another length; that are tried over all N samples
+# Of the shortened record: samples, or periods of the best square if more
+SEARCH_ROWS, SEARCH_PERIODS = (512, 40)
+# Patterns that are improved, each of another length; that are tried over all N samples
+STARTS, FINALISTS = (6, 12)
 LEAST_GAIN = 1e-4  # of the cost, relative, for another change of a pattern
 SINGULAR = 1e12  # condition number of Φ above which neither bias nor variance is computed
 MOST_SAMPLES = 10_000_000  # of a design: its candidates take hours then
@@ -147,9 +143,8 @@ LARGEST = 1e100  # amplitude, and one over the smallest: squares are finite
 _SIGNALS = 120  # of N samples that are held at once
 BATCH = 2_000_000  # samples that are simulated side by side
 
-Factors = Float[
-    np.ndarray, "M 2 n n"
-]  # per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
+# Per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1
+Factors = Float[np.ndarray, "M 2 n n"]
 
 
 @runtime_checkable

@@ -43,10 +43,8 @@ _SMALL = 0.05  # of the residual's variance: what could be predicted below that 
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
 _HOLD = 0.5  # share of the squares in wild rows
-_FEW, _LEAST = (
-    0.005,
-    6,
-)  # share of the rows that these are at most, and the number that is always few
+# Share of the rows that these are at most, and the number that is always few
+_FEW, _LEAST = (0.005, 6)
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _MAD = 1.4826
 _NAMED = 3

@@ -55,9 +55,8 @@ def transitions(
     width = difference_width(states) if len(states) else np.ones(n0)
     batches = [np.zeros((0, n0, n0))]
     for begin in range(0, len(states), _BATCH):
-        rows = np.minimum(
-            np.arange(begin, begin + _BATCH), len(states) - 1
-        )  # the last one again: one shape
+        # The last one again: one shape
+        rows = np.minimum(np.arange(begin, begin + _BATCH), len(states) - 1)
         found = _transitions(model.form, model.numbers, states[rows], inputs[rows], width)
         batches.append(np.asarray(found)[: len(states) - begin])
     return np.concatenate(batches)

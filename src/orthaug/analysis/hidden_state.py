@@ -34,25 +34,15 @@ _LEVEL = 0.01
 _ROWS_PER_COLUMN = 4
 _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding and the integrator's
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
-_CENTRES = (
-    0.05,
-    0.2,
-    0.35,
-    0.5,
-    0.65,
-    0.8,
-    0.95,
-)  # quantiles about which a function of a learner's feature bends
+# Quantiles about which a function of a learner's feature bends
+_CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 _STATIC = 5
 _MULTIPLIED = 8  # features, of which products of pairs are taken
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
-_SETTLING, _HALVINGS, _SETTLED = (
-    8,
-    4,
-    0.01,
-)  # steps, shorter ones, and the fall of the squares that ends them
+# Steps, shorter ones, and the fall of the squares that ends them
+_SETTLING, _HALVINGS, _SETTLED = (8, 4, 0.01)
 
 
 @dataclass(frozen=True)
@@ -411,9 +401,8 @@ def _test_families(
         return None
     starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
     q = _range(whole[:, starts])
-    whole = whole - q @ (
-        q.T @ whole
-    )  # they move a few rows of one run only: blocks would not show them
+    # They move a few rows of one run only: blocks would not show them
+    whole = whole - q @ (q.T @ whole)
     whole[:, starts] = 0.0
     size = np.linalg.norm(whole, axis=0)
     size = np.where(size > 0, size, 1.0)

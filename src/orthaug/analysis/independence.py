@@ -162,9 +162,8 @@ def _spectral_product(a: Vector, u: list[Vector]) -> float:
         return 1.0
     product = 0.0
     for one in u:
-        size = (
-            1 << max(2 * len(one), 2048).bit_length()
-        )  # zeros behind the record, so that it does not meet its start
+        # Zeros behind the record, so that it does not meet its start
+        size = 1 << max(2 * len(one), 2048).bit_length()
         gain = (
             1 / np.maximum(np.abs(np.fft.fft(a, size)), np.finfo(float).eps * np.abs(a).sum()) ** 2
         )
@@ -177,9 +176,8 @@ def _lag_blocks(e: list[Vector], u: list[Vector], a: Vector, lags: int) -> Itera
 
     If rows are few also the first, with lags at the input's mean.
     """
-    known = (
-        lags if 2 * lags * len(e) < sum(map(len, e)) else 0
-    )  # a start from rest would excite all directions
+    # A start from rest would excite all directions
+    known = lags if 2 * lags * len(e) < sum(map(len, e)) else 0
     for one, other in zip(e, u, strict=True):
         if len(one) >= len(a):
             target = np.convolve(one, a, "valid")
@@ -246,9 +244,8 @@ def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
     rank, freedom = int(kept.sum()), rows - kept.sum() - intercept
     if rank == 0 or freedom < 1 or total <= 0:
         return None
-    root = (
-        unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
-    )  # of the inverse of the inner products
+    # Of the inverse of the inner products
+    root = unit[:, None] * vectors[:, kept] / np.sqrt(values[kept])
     explained = np.sum((root.T @ moment) ** 2)
     left = max(total - explained, np.finfo(float).eps * total) / freedom
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / left))

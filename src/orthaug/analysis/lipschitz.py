@@ -166,9 +166,8 @@ def _weight_sizes(
     size = min(_BATCH, max(1, _BATCH_CELLS // cells))
     squares = []
     for begin in range(0, len(some), size):
-        rows = some[
-            np.minimum(np.arange(begin, begin + size), len(some) - 1)
-        ]  # the last one again: one shape
+        # The last one again: one shape
+        rows = some[np.minimum(np.arange(begin, begin + size), len(some) - 1)]
         columns = [_weight_squares(form, numbers, x[rows], direction) for direction in directions]
         squares.append(
             np.stack([np.asarray(column) for column in columns], axis=-1)[: len(some) - begin]

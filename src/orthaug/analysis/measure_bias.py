@@ -196,9 +196,8 @@ def physical_slopes(
     if physics is None:
         return None
     p = physical_of(physics, problem, theta)
-    of_theta = np.abs(
-        physics.theta(p)
-    )  # scales of θ and p, so that the pseudo-inverse sees numbers of one size
+    # Scales of θ and p, so that the pseudo-inverse sees numbers of one size
+    of_theta = np.abs(physics.theta(p))
     of_theta, of_p = np.where(of_theta > 0, of_theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
     inverse = np.linalg.pinv(physics.jacobian(p) / of_theta[:, None] * of_p)
     rows = np.zeros((len(p), len(problem.baseline.names)))

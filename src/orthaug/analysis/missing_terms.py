@@ -80,9 +80,8 @@ def sensitivities(
     """
     segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
     form = segmented.dynamics
-    runs = np.moveaxis(
-        segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1
-    )  # (k, m, T, n0)
+    # (k, m, T, n0)
+    runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)
     segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
     k, m = runs.shape[:2]
     x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))

@@ -215,9 +215,8 @@ class MotionLinearization:
         motion, names = self.motion, self.motion.names
         place = suspect.place(motion)
         basis, certificate, explained, found = self.shared.basis, None, None, None
-        trained = bool(
-            len(self.place.w)
-        )  # a learner that is not may hold all along shared directions
+        # A learner that is not may hold all along shared directions
+        trained = bool(len(self.place.w))
         apart = (
             np.zeros(len(names), dtype=bool)
             if trained

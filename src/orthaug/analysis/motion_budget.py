@@ -269,9 +269,8 @@ def _of_learner(
             if (each := one_of_each(linearization, terms))
         ]
         joint, each = next((pair for pair in found if pair[0] >= AS_MUCH * found[-1][0]), (0.0, []))
-        enough = 1 - (1 - LEAST_SHARE) ** len(
-            each
-        )  # as much of what the others leave as one must explain of all
+        # As much of what the others leave as one must explain of all
+        enough = 1 - (1 - LEAST_SHARE) ** len(each)
         if joint >= enough and (share < LEAST_SHARE or 1 - share >= _AS_CLOSE * (1 - joint)):
             alone, share = each, joint
     return None if share < LEAST_SHARE else _weigh_causes(linearization, alone, share, every)

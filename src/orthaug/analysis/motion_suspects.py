@@ -32,14 +32,8 @@ if TYPE_CHECKING:
     from orthaug.analysis.memory import MemoryTerm
 
 _OF_STATES = ("coulomb", "quadratic_drag", "cubic")
-_WIDTHS = (
-    0.125,
-    0.25,
-    0.5,
-    1.0,
-    2.0,
-    4.0,
-)  # of friction that turns round smoothly, in median sizes of what it acts on
+# Of friction that turns round smoothly, in median sizes of what it acts on
+_WIDTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 _OF_INPUTS = ("cubic", "dead_zone", "saturation")
 _OF_FEATURES = (*_OF_STATES, "dead_zone")
 

@@ -27,10 +27,8 @@ _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances 
 BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
 _STEPS = 400  # that a disturbance is followed
 _TUNED_ROWS = 4000
-_KEPT_ROWS, _KEPT_STATES = (
-    1000,
-    30,
-)  # a fit tunes on so many rows, unless the filter has more states
+# A fit tunes on so many rows, unless the filter has more states
+_KEPT_ROWS, _KEPT_STATES = (1000, 30)
 _REACH = 14.0  # of the search, in e-folds
 _STEP = -1.5  # of the search at first, in e-folds
 _LARGE = 1e12

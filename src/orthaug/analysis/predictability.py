@@ -88,9 +88,8 @@ class Share:
         if not (total > 0 and np.isfinite(gained).all()):
             return cls(0.0, 0.0)
         value = float(gained.sum() / total)
-        off = (
-            gained - value * without
-        )  # of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        # Of a ratio of sums: loud blocks may gain more (Cochran 1977, sect. 2.11)
+        off = gained - value * without
         return cls(value, float(np.sqrt(len(off)) * off.std(ddof=1) / total))
 
     @property

@@ -18,10 +18,8 @@ from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
 from orthaug.physics.streamed import StreamedProblem
 
-_FEWEST_ROWS, _ROWS_PER_TERM = (
-    100,
-    10,
-)  # rows that a sum of autocovariances needs, in all and for each of its lags
+# Rows that a sum of autocovariances needs, in all and for each of its lags
+_FEWEST_ROWS, _ROWS_PER_TERM = (100, 10)
 # A variance of a sum needs so many blocks, which Student's t counts; shorter ones covered 85 %.
 _FEWEST_BLOCKS = 12
 # An autoregressive model needs so many independent errors, less one; Student's t counts them.

@@ -55,11 +55,8 @@ _KINDS = {
 KINDS = tuple(_KINDS)
 WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
 WITH_MEMORY = tuple(kind for kind, entry in _KINDS.items() if entry.memory)
-ODD_JUMPS = (
-    "coulomb",
-    "stribeck",
-    "stribeck_gauss",
-)  # the kinds that jump where their argument changes sign
+# The kinds that jump where their argument changes sign
+ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")
 _VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
 _POSITION = ("cubic", "dead_zone")
 _SINGLE = (

@@ -30,10 +30,8 @@ from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
-_BEYOND, _FAR = (
-    0.01,
-    0.1,
-)  # of the training range: an excursion that is reported, and one that counts on any row
+# Of the training range: an excursion that is reported, and one that counts on any row
+_BEYOND, _FAR = (0.01, 0.1)
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
 # Ratio of errors below which an interval that holds 1 leaves undecided what is not shown

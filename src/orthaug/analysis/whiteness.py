@@ -15,13 +15,11 @@ import scipy.special
 from orthaug._base.checks import Vector
 from orthaug.fitting.colour import burg
 
-Pieces = (
-    Sequence[Vector] | Vector
-)  # a signal in one piece per experiment; a plain vector is one experiment
+# A signal in one piece per experiment; a plain vector is one experiment
+Pieces = Sequence[Vector] | Vector
 
-CONSTANT = (
-    64 * np.finfo(float).eps
-)  # rounding of the mean: a smaller deviation, against the largest value, is none
+# Rounding of the mean: a smaller deviation, against the largest value, is none
+CONSTANT = 64 * np.finfo(float).eps
 LARGEST = 1e150  # squares of larger values overflow: a model that left all bounds has no statistics
 # Their products take half as long as the transforms at 10⁶ rows, twice as long at 10⁴
 _FEW_LAGS = 100
@@ -61,9 +59,8 @@ def _products(x: Vector, y: Vector, reach: int) -> Vector:
             x[max(t, 0) : len(x) + min(t, 0)] @ y[max(-t, 0) : len(y) - max(t, 0)] for t in lags
         ]
         return np.pad(found, reach - own)
-    size = (
-        1 << (len(x) + reach).bit_length()
-    )  # zeros behind the record, so that it does not meet its start
+    # Zeros behind the record, so that it does not meet its start
+    size = 1 << (len(x) + reach).bit_length()
     products = np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(y, size).conj(), size)
     return np.concatenate([products[size - reach :], products[: reach + 1]])
 

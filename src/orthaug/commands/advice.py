@@ -373,10 +373,8 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
-_MOST, _MOST_OF_A_MOTION = (
-    3,
-    2,
-)  # changes that are tried: together they take about as long as the fit
+# Changes that are tried: together they take about as long as the fit
+_MOST, _MOST_OF_A_MOTION = (3, 2)
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 

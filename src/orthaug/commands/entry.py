@@ -11,16 +11,10 @@ import sys
 
 from orthaug.commands.signals import WATCH
 
-_OF_JAX = (
-    "JAX_PLATFORMS",
-    "JAX_ENABLE_X64",
-    "JAX_COMPILATION_CACHE_DIR",
-    "JAX_DISABLE_JIT",
-)  # the others are dropped
-_LEAST_MEMORY, _MEMORY_PER_CORE = (
-    3.0 * 2**30,
-    0.15 * 2**30,
-)  # bytes of addresses that JAX and BLAS take for themselves
+# The others are dropped
+_OF_JAX = ("JAX_PLATFORMS", "JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "JAX_DISABLE_JIT")
+# Bytes of addresses that JAX and BLAS take for themselves
+_LEAST_MEMORY, _MEMORY_PER_CORE = (3.0 * 2**30, 0.15 * 2**30)
 
 
 def main() -> None:

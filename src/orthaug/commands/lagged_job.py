@@ -113,9 +113,8 @@ class LaggedJob(Job):
         A fold is small: its rows are in memory.
         """
         spec, options = self.spec, self.training_options(variant.on(self.train.record))
-        options["structure"] = spec.declared_structure(
-            variant.structure_kind
-        )  # scored by predictions, on which the measure has no effect
+        # Scored by predictions, on which the measure has no effect
+        options["structure"] = spec.declared_structure(variant.structure_kind)
         weights, lags, learner_inputs = spec.training.output_weights, None, None
         if not variant.physics_only and spec.declared_learner() is not None:
             lags, learner_inputs = spec.lag_orders(), spec.learner_inputs()
@@ -197,9 +196,8 @@ def open_lagged(path: Path, spec: Spec, *, require_full_rank: bool = True) -> La
         }
         kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
         engine = engine_of(spec.engine, kind)
-        several = (
-            spec.runs(linear=baseline.linear) > 1 and train.source is None
-        )  # on a cluster they are its tasks
+        # On a cluster they are its tasks
+        several = spec.runs(linear=baseline.linear) > 1 and train.source is None
         if kind in ("memory", "devices") or spec.brought or (kind == "dask" and several):
             problem = pose(train.record, baseline, lags, learner_inputs, **options)
         else:

@@ -196,9 +196,8 @@ def open_run(
         prepared_notes(loaded, record if reading.prepare else None),
     )
     if record.missing:
-        estimated = (
-            need_outputs and loaded.form.states and not loaded.form.memory
-        )  # a state to predict from
+        # A state to predict from
+        estimated = need_outputs and loaded.form.states and not loaded.form.memory
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
         notes += (f"note: {data}: {text}",)

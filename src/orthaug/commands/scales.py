@@ -6,10 +6,8 @@ import numpy as np
 
 from orthaug.data.record import Record
 
-_SMALL, _LARGE = (
-    1e-8,
-    1e8,
-)  # in the unit of a channel: beyond these a scale is more often wrong than right
+# In the unit of a channel: beyond these a scale is more often wrong than right
+_SMALL, _LARGE = (1e-8, 1e8)
 _FAR = 1e5  # a mean so many times the spread is more often an offset than a signal
 
 

@@ -47,9 +47,8 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     trained = [trained_reading(model, path) for path in data]
     read, notes = [], []
     for path, own in zip(data, trained, strict=True):
-        reading = own or ReadOptions(
-            "skip", prepare=True
-        )  # of rows with missing cells none were trained on
+        # Of rows with missing cells none were trained on
+        reading = own or ReadOptions("skip", prepare=True)
         taken = rows_taken(reading)
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []

@@ -26,9 +26,8 @@ DATES = "dates"
 _JITTERS = 0.02  # largest deviation of a step that is not reported, relative
 _HEAD = 10_000  # rows of a text file that are enough to determine its step
 _FEWEST = 10  # rows from which on rising evenly is no chance
-_MOSTLY = (
-    0.98  # share of the steps of a time that are as usual at least; the others are lost samples
-)
+# Share of the steps of a time that are as usual at least; the others are lost samples
+_MOSTLY = 0.98
 # Share of rising steps from which on a column named as the time is a time with a fault.
 _RISES = 0.9
 _COUNTING = (0.0, 1.0)  # where counters of rows begin

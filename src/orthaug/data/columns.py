@@ -27,13 +27,8 @@ _FINEST = 1e5  # steps within the range from which on rounding of the numbers co
 _COARSE = 0.02  # steps of a signal over its standard deviation that are reported
 SPIKE = 15.0
 """Deviations from its neighbours from which on a sample is a spike."""
-_LOWER = (
-    SPIKE,
-    10.0,
-    7.0,
-    5.0,
-    4.0,
-)  # tried where a sample is far outside the range of all others
+# Tried where a sample is far outside the range of all others
+_LOWER = (SPIKE, 10.0, 7.0, 5.0, 4.0)
 _BEYOND = 0.5  # of that range
 _OUTSIDE = 2.5  # interquartile ranges from the middle
 _FEW = 0.01  # share of samples that spikes are at most
@@ -84,9 +79,8 @@ class Column:
         x = self.finite
         edges = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1, [len(x)]])
         held = np.diff(edges)
-        held = held[
-            (held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])
-        ]  # as inputs are, between their steps
+        # As inputs are, between their steps
+        held = held[(held > 1) & ~np.isin(x[edges[:-1]], levels[[0, -1]])]
         least = max(
             _HELD,
             _OFTEN * float(np.median(counts)),

@@ -40,10 +40,8 @@ _NO_NUMBERS = {
     17: "an opaque object",
 }
 _COMPLEX_FLAG = 0x0800
-_HEADER, _PREFIX = (
-    128,
-    4096,
-)  # bytes of the file's header; of a compressed variable that hold its name and shape
+# Bytes of the file's header; of a compressed variable that hold its name and shape
+_HEADER, _PREFIX = (128, 4096)
 
 
 @dataclass(frozen=True, eq=False)

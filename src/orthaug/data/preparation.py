@@ -16,11 +16,8 @@ from orthaug.data.prepared import Prepared
 from orthaug.data.record import Experiment, Record, same_step, unbroken
 from orthaug.data.steps import Channels, Detrend, Fill, Outliers, Resample, Run, Shift, Step
 
-_ANTI_ALIAS, _RIPPLE, _CORNER = (
-    8,
-    0.05,
-    0.8,
-)  # Chebyshev filter of decimation: order, dB, share of the new Nyquist
+# Chebyshev filter of decimation: order, dB, share of the new Nyquist
+_ANTI_ALIAS, _RIPPLE, _CORNER = (8, 0.05, 0.8)
 
 Phase = Annotated[str, OneOf(("zero", "causal"))]
 

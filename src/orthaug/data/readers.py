@@ -35,15 +35,8 @@ from orthaug.data.tables import Table, check_readable, has_column, read_table
 RowRange = tuple[int, int] | list[int]
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
 _LATEST = 1e11  # s; later than the year 5000
-_MISSING = (
-    "",
-    "nan",
-    "na",
-    "n/a",
-    "#n/a",
-    "null",
-    "none",
-)  # how files write a sample that is not there
+# How files write a sample that is not there
+_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")
 
 
 def read_record(

@@ -27,9 +27,8 @@ from orthaug.data.matlab import MOST_ELEMENTS, Variable, read_mat5
 _NAMED = 30  # variables that a message lists
 _HDF5, _USERBLOCK = b"\x89HDF\r\n", 4096  # how such a file begins, and before which byte it does
 _DIGITS = 10  # of an index at most
-Wanted = (
-    Sequence[str] | Callable[[str], bool] | None
-)  # names, a choice of single numbers, or all names
+# Names, a choice of single numbers, or all names
+Wanted = Sequence[str] | Callable[[str], bool] | None
 _MOST_HELD, _DEEPEST = 10_000, 8  # variables that are noted, and references one behind the other
 _LABELS = {
     "Data": "Name",
@@ -37,9 +36,8 @@ _LABELS = {
 }  # fields of dSPACE and of Simulink: a signal, and what it is called
 _LONGEST_NAME = 200  # characters of such a name at most
 _ROOT = re.compile(r"[./\[]")  # what follows the name of a variable in a path
-_ELEMENT = re.compile(
-    r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]"
-)  # as MATLAB writes it
+# As MATLAB writes it
+_ELEMENT = re.compile(r"[({]\s*(?::\s*,\s*)?([1-9]\d{0,8})\s*(,\s*:\s*)?[)}]")
 
 
 @dataclass(frozen=True)
@@ -128,18 +126,15 @@ def _from_npz(path: Path, names: Wanted) -> dict[str, Vector]:
 
 
 _LONGEST_HEAD = 2**16  # bytes of a member that are unpacked to know what it is
-_LARGE, _DENSEST = (
-    2**28,
-    300,
-)  # bytes of an array that may shrink as it likes, and by how much a larger one may
+# Bytes of an array that may shrink as it likes, and by how much a larger one may
+_LARGE, _DENSEST = (2**28, 300)
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FileVariable:
     """Return an array of an archive by its header; Python objects are never opened."""
     with archive.open(info) as member:
-        head = io.BytesIO(
-            member.read(_LONGEST_HEAD)
-        )  # a header may declare a length of its own, in gigabytes
+        # A header may declare a length of its own, in gigabytes
+        head = io.BytesIO(member.read(_LONGEST_HEAD))
     version = np.lib.format.read_magic(head)
     read = {
         (1, 0): np.lib.format.read_array_header_1_0,

@@ -21,10 +21,8 @@ from orthaug.data.steps import Outliers
 
 # Times the distance of the farthest other sample: 1 in 4000 of Student's t, 4 degrees of freedom.
 _APART = 8.0
-_FEW, _LEAST = (
-    0.005,
-    1,
-)  # share of a channel's samples that are wild at most, and the number that is always few
+# Share of a channel's samples that are wild at most, and the number that is always few
+_FEW, _LEAST = (0.005, 1)
 _RESPONSE = 50  # rows within which an output answers an input
 _ANSWERS = 3.0  # times what it was before
 _FIRST = 10  # rows before which nothing was seen to compare with

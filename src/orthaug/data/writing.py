@@ -9,18 +9,8 @@ from fractions import Fraction
 
 from orthaug.data.expressions import Expression
 
-_PLAIN = (
-    "sign",
-    "tanh",
-    "sin",
-    "cos",
-    "tan",
-    "atan",
-    "atan2",
-    "exp",
-    "log",
-    "floor",
-)  # of numbers without unit
+# Of numbers without unit
+_PLAIN = ("sign", "tanh", "sin", "cos", "tan", "atan", "atan2", "exp", "log", "floor")
 _SAME = ("abs", "min", "max")
 _LATEX = {
     "sin": r"\sin",

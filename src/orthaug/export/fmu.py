@@ -23,14 +23,8 @@ from orthaug.export.program import Program, Vectors
 _WRAPPER = Path(__file__).parent / "templates" / "fmi2.c"
 _SOURCES = ("model.c", "fmi2.c")
 _PLATFORMS = {"linux": ("linux64", ".so"), "darwin": ("darwin64", ".dylib")}
-_EPOCH = (
-    2020,
-    1,
-    1,
-    0,
-    0,
-    0,
-)  # of the files in the archive, so that the same model makes the same archive
+# Of the files in the archive, so that the same model makes the same archive
+_EPOCH = (2020, 1, 1, 0, 0, 0)
 _PATIENCE = 300  # seconds that a compiler may take
 
 

@@ -129,9 +129,8 @@ class RunCheckpoint:
         from safetensors.numpy import load
 
         try:
-            content = (
-                self.path.read_bytes()
-            )  # mapped into memory, it could not be replaced on Windows
+            # Mapped into memory, it could not be replaced on Windows
+            content = self.path.read_bytes()
         except OSError:
             return None
         try:

@@ -331,9 +331,8 @@ def fit(
     if task.bound is None and solved:
         estimate = _physics_alone(task, structure)
     else:
-        task = replace(
-            task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints
-        )  # not a worker's disk
+        # Not a worker's disk
+        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
         trained = task if solved else FreeRunTask.of(task, criterion, warm)
         chosen = Choice(
             validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved

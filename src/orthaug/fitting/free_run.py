@@ -33,12 +33,8 @@ from orthaug.fitting.structures import Structure
 from orthaug.physics.streamed import StreamedProblem
 
 _SHORTEST = 4  # steps of a segment
-_LONGER = (
-    4.0,
-    2.0,
-    1.4,
-    1.15,
-)  # times, from one length of the segments to the next: the first with a finite run
+# Times, from one length of the segments to the next: the first with a finite run
+_LONGER = (4.0, 2.0, 1.4, 1.15)
 _SHRUNK = (0.99, 0.9, 0.5, 0.0)  # of the one-step θ: less feedback diverges later
 
 
@@ -137,9 +133,8 @@ def _over_whole(
     end = whole.descend(whole.objective(structure), best[1], solver)
     if not end.ending.usable:
         return []
-    own = plan.descend(
-        objective, end.end.point.p, solver.at_most(0)
-    )  # its statistics are those of the plan's segments
+    # Its statistics are those of the plan's segments
+    own = plan.descend(objective, end.end.point.p, solver.at_most(0))
     if not own.ending.usable:
         return []
     own = own._replace(end=own.end._replace(ending=end.ending, tail=end.end.tail))

@@ -22,9 +22,8 @@ from orthaug.models.response import Response
 
 WORTH = 0.02  # of the error: less than this is neither help nor harm
 _FEWEST = 20  # usable rows of a block
-_STRETCHES = (
-    20  # pieces of a free run that the bootstrap draws from: longer than its errors remember
-)
+# Pieces of a free run that the bootstrap draws from: longer than its errors remember
+_STRETCHES = 20
 _DRAWS = 999
 
 Pieces = Sequence[Vector | None]

@@ -53,14 +53,8 @@ STRUCTURES = Registry(
     },
     reserved=("kind", "measure"),
 )
-_BESIDE = (
-    "solver",
-    "focus",
-    "restarts",
-    "ensemble",
-    "seed",
-    "regularization",
-)  # the other keys of [training]
+# The other keys of [training]
+_BESIDE = ("solver", "focus", "restarts", "ensemble", "seed", "regularization")
 CRITERIA = Registry(
     "criterion",
     {"auto": Auto, "prediction": Prediction, "simulation": Simulation},

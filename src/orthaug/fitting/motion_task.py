@@ -36,14 +36,12 @@ from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.motion_problem import MotionProblem
 
 _SHORTEST = 15  # steps of a segment
-_LONGER = (
-    8  # times, from one length of the segments to the next; every length compiles its own programs
-)
+# Times, from one length of the segments to the next; every length compiles its own programs
+_LONGER = 8
 _POOR = 0.5  # of the output's deviation: what is left above it may not be the best minimum
 _SHORT_ITERATIONS = 15  # over segments that are not the last
-_SETTLING = (
-    200  # steps at most by which starts follow the outputs: a descent damps no step of theirs
-)
+# Steps at most by which starts follow the outputs: a descent damps no step of theirs
+_SETTLING = 200
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 _LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
@@ -295,9 +293,8 @@ class MotionTask(SimulationTask):
 
         A learner that cannot be silenced starts as it is.
         """
-        silenced = (
-            w if self.bound is None else self.bound.silent(w)
-        )  # no learner: physics alone had no finite run
+        # No learner: physics alone had no finite run
+        silenced = w if self.bound is None else self.bound.silent(w)
         q = (
             self.problem.motion.coordinates.initial
             if self.physics is None

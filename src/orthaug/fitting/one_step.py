@@ -198,9 +198,8 @@ class OneStepTask(TrainingRows):
             plain and solver.gauss_newton and solver.iterations and self._is_above_physics(run)
         ):
             return run
-        silent = (
-            self.bound.silent(np.asarray(w)) if self.bound else None
-        )  # its runs end below physics alone
+        # Its runs end below physics alone
+        silent = self.bound.silent(np.asarray(w)) if self.bound else None
         w = w if silent is None else jnp.asarray(silent)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
         if (

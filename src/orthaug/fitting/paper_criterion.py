@@ -124,13 +124,11 @@ class JointOneStep:
     ) -> Normal:
         nt = len(physics.outputs)
         v, w = p[:nt], p[nt:]
-        known = Overlap(
-            before.jacobian[:, nt:], before.values
-        )  # of QᵀJ and QᵀF, subtracted from the rows
+        # Of QᵀJ and QᵀF, subtracted from the rows
+        known = Overlap(before.jacobian[:, nt:], before.values)
         blocks, free = Blocks(self.bound), Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
-        rest = collect(
-            row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known
-        )  # what is orthogonal to Q
+        # What is orthogonal to Q
+        rest = collect(row_sum(lambda chunk: blocks(chunk, w, known), rows), free, known)
         share = rest.overlap
         miss = physics.outputs - physics.start - physics.basis @ v - share.values  # Qᵀ(Y − Φθ − F)
         slope = jnp.concatenate([physics.basis, share.jacobian], axis=1)  # Qᵀ of all columns

@@ -116,9 +116,8 @@ class Recursion:
         scaled = r / np.where(norms > 0, norms, 1.0)
         size = np.linalg.svd(scaled, compute_uv=False)
         self.determined = bool(size[-1] > _DETERMINED * size[0])
-        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[
-            0
-        ]  # the least that explains the rows
+        # The least that explains the rows
+        change = np.linalg.lstsq(scaled, z, rcond=_DETERMINED)[0]
         return self.start + change / np.where(norms > 0, norms, 1.0)
 
     def _forget(self) -> None:

@@ -25,9 +25,8 @@ from orthaug._base.checks import Matrix, Vector
 
 SCALES = (1, 4, 16, 64)
 _RATIO = 2.0  # of the variance that is looked for
-_LARGEST = (
-    4.0  # deviations: what is beyond counts as that, so that no single outlier raises an alarm
-)
+# Deviations: what is beyond counts as that, so that no single outlier raises an alarm
+_LARGEST = 4.0
 _GROSS = 10.0
 _HIGHEST = 1.2  # of the limit: so that an alarm ends soon after its cause
 _ARMED = 0.5

@@ -20,9 +20,8 @@ from orthaug.physics.motion import Motion
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
 _MOST = 10**18  # weights or runs; more are as impossible, and would overflow
-_COPIES = (
-    32  # of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
-)
+# Of regressors and outputs, in a fit with its scores and findings; measured on 10⁶ rows
+_COPIES = 32
 _FEWEST = 50  # iterations that are counted on where more are allowed: most runs converge
 
 

@@ -117,9 +117,8 @@ class SegmentedLagged(SegmentedProblem):
     def objective(self, structure: Structure) -> StructuredObjective:
         """Return the criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
-        free = (
-            elimination.projects and not elimination.bounded and self.bound is not None
-        )  # the unknown is c
+        # The unknown is c
+        free = elimination.projects and not elimination.bounded and self.bound is not None
         bounds = elimination.lower.copy(), elimination.upper.copy()
         for i, value in self.fixed.items():
             bounds[0][i] = bounds[1][i] = value

@@ -175,9 +175,8 @@ class SegmentedProblem:
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
         white = None if noise is None else whitening_matrix(noise)
         if noise is not None and white is not None:
-            size = (
-                np.trace(objective.weight @ noise @ objective.weight.T) / ny
-            )  # so that the ridge keeps its place
+            # So that the ridge keeps its place
+            size = np.trace(objective.weight @ noise @ objective.weight.T) / ny
             objective = replace(objective, weight=np.sqrt(size) * white)
             done = end.iterations
             begun, options = (

@@ -49,9 +49,8 @@ def _lowers_loss(free_fit: FreeRunFit, first_loss: float) -> bool:
     return bool(free_fit.end.point.loss < LEARNED * first_loss)
 
 
-Task = TypeVar(
-    "Task", bound="SimulationTask"
-)  # Self is nothing that run-time checks of annotations can read
+# Self is nothing that run-time checks of annotations can read
+Task = TypeVar("Task", bound="SimulationTask")
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,9 +234,8 @@ class SimulationTask(ABC):
         def middle(noise: Matrix) -> Matrix:
             """Return ΣψᵀΣ_eψ of the rows of `gram`, white where `weight` made them so."""
             assert gram is not None
-            change = objective.weight @ np.linalg.inv(
-                self.problem.weight.matrix
-            )  # of errors in whitened outputs
+            # Of errors in whitened outputs
+            change = objective.weight @ np.linalg.inv(self.problem.weight.matrix)
             white = change @ noise @ change.T * rms**2
             return gram * float(np.trace(white)) / len(white)
 

@@ -114,9 +114,8 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
         if kept.sum() >= _FEWEST * len(names):
             break
     before, after = (part[kept] for part in slopes)  # (M, nx + ny, np)
-    after = np.where(
-        _has_learner(motion)[:, None], after, 0.0
-    )  # what has no learner must not move at all
+    # What has no learner must not move at all
+    after = np.where(_has_learner(motion)[:, None], after, 0.0)
     size = np.sqrt(np.mean(before**2, axis=(0, 2), keepdims=True))
     size = np.where(size > 0, size, 1.0)
     before, after = (

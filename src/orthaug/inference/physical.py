@@ -423,9 +423,8 @@ def profile(
         return float(np.clip(cost - least - limit, -limit, 1e6 * limit))
 
     slope = np.linalg.norm(jacobian[:, i])
-    step = (
-        float(1 / slope) if slope > 0 else 1e-3 * physics.size[i]
-    )  # at most one standard deviation
+    # At most one standard deviation
+    step = float(1 / slope) if slope > 0 else 1e-3 * physics.size[i]
     bounds = (physics.parameters[i].min, physics.parameters[i].max)
     low, high = (
         _find_crossing(excess, best[i], sign * step, bound)

@@ -81,9 +81,8 @@ class Dask(Threads):
     def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
         """Return the partitions of a source, built where they will be summed."""
         with cluster_errors():
-            task = partial(
-                _build_chunks, row_builder=row_builder, size=self.limit
-            )  # not scattered: what is lost can be made again
+            # Not scattered: what is lost can be made again
+            task = partial(_build_chunks, row_builder=row_builder, size=self.limit)
             return [self._task_on(task, partition) for partition in source.partitions]
 
     def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:

@@ -32,9 +32,8 @@ from orthaug.models.rows import (
 )
 
 _ROWS = "rows"
-_ONE_AT_A_TIME = (
-    threading.Lock()
-)  # devices that wait for each other in two programs would wait for ever
+# Devices that wait for each other in two programs would wait for ever
+_ONE_AT_A_TIME = threading.Lock()
 _MATRICES = 3  # the sum so far, what a chunk adds, and what all devices have
 
 
@@ -52,9 +51,8 @@ class Devices(LocalEngine):
     resident: bool = False
 
     def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
-        count, size = chunk_shape(
-            -(-len(z) // self.shares), self.limit
-        )  # of the chunks of one share
+        # Of the chunks of one share
+        count, size = chunk_shape(-(-len(z) // self.shares), self.limit)
         return self.place(build_chunk(z, q, e, gain, (count * self.shares, size)))
 
     def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:

@@ -292,9 +292,8 @@ class External:
         """
         z = np.asarray(z)
         every = z.reshape(-1, z.shape[-1])
-        finite = np.isfinite(every).all(
-            axis=1
-        )  # a run that diverged ends as NaN, not in the toolbox's own error
+        # A run that diverged ends as NaN, not in the toolbox's own error
+        finite = np.isfinite(every).all(axis=1)
         result = np.full((len(every), self.ny), np.nan)
         if finite.any():
             result[finite] = self._evaluate(every[finite])

@@ -294,9 +294,8 @@ class Model(RecordModel, NotebookView):
         inputs = self.form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
-        largest = max(
-            1, _WINDOW_CELLS // max(1, windows[0].size)
-        )  # windows overlap: they are copied batch by batch
+        # Windows overlap: they are copied batch by batch
+        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
         return _in_batches(
             lambda s, u: _last_outputs(self.form, self.numbers, s, u, horizon),
             (states, windows),

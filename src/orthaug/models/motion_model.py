@@ -395,9 +395,8 @@ class MotionModel(RecordModel, NotebookView):
 
     def _predict_ahead(self, experiment: Experiment, record: Record, horizon: int) -> Trajectory:
         self.check_rows(experiment, horizon)
-        window = min(
-            self.window, len(experiment) - horizon
-        )  # short recordings have at least one prediction
+        # Short recordings have at least one prediction
+        window = min(self.window, len(experiment) - horizon)
         first = window + horizon - 1
         outputs, physics = self._predict_windows(experiment, record, horizon, window)
         nothing = np.zeros_like(outputs)

@@ -25,10 +25,8 @@ from orthaug.models.lagged import Lagged
 from orthaug.models.learners import Bound
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
-_FEW, _SHARED = (
-    1024,
-    256,
-)  # rows: so few take less time than to compile for their number, or for that of a fold
+# Rows: so few take less time than to compile for their number, or for that of a fold
+_FEW, _SHARED = (1024, 256)
 
 
 class Chunk(NamedTuple):

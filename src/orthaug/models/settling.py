@@ -168,9 +168,8 @@ def _gram(
         inputs, target, there = (part[i] for part in windows)
         value, slope = jax.vmap(step_with_slopes, -1, -1)(state, inputs)
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
-        slope: Any = sum(
-            slope[:, i, None] * slopes[None, i] for i in range(n0)
-        )  # products of lanes are no matrix products
+        # Products of lanes are no matrix products
+        slope: Any = sum(slope[:, i, None] * slopes[None, i] for i in range(n0))
         columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
         columns = jnp.where(there, columns, 0.0)
         columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))

@@ -9,9 +9,8 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 
-_ROUNDING = (
-    1e-13  # of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
-)
+# Of the largest eigenvalue of a Gram matrix with unit columns: what is below is rounding
+_ROUNDING = 1e-13
 
 
 def column_units(gram: Matrix, nt: int) -> Vector:

@@ -184,9 +184,8 @@ def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
                 yield Chunk(*parts)
                 parts, held = [], 0
     if parts:
-        parts[0][..., held:] = parts[0][
-            ..., held - 1 : held
-        ]  # zeros may be where the learner has no value
+        # Zeros may be where the learner has no value
+        parts[0][..., held:] = parts[0][..., held - 1 : held]
         yield Chunk(*parts)
 
 

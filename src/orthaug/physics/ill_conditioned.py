@@ -26,9 +26,8 @@ _FEW = 2.5
 # independent columns of a set that nearly cancels; polynomials spread over more, and want no term
 # fixed
 _CLEARLY = 4.0  # standard errors from zero
-_PART = (
-    0.01  # of the projector onto the nearly dependent directions: a column that takes part in one
-)
+# Of the projector onto the nearly dependent directions: a column that takes part in one
+_PART = 0.01
 
 
 def of_physics(

@@ -77,9 +77,8 @@ class Exponentials(NamedTuple):
     @classmethod
     def of(cls, linear: Any, h: float) -> Exponentials:
         """Return the exponentials of A (nx, nx) over a step h."""
-        both = jax.vmap(lambda a: _phi(a, 3))(
-            jnp.stack([linear * h, linear * h / 2])
-        )  # at once: less to compile
+        # At once: less to compile
+        both = jax.vmap(lambda a: _phi(a, 3))(jnp.stack([linear * h, linear * h / 2]))
         (whole, half), (phi1, half1), (phi2, _), (phi3, _) = both
         return cls(linear, whole, phi1, phi2, phi3, half, half1 * h / 2)
 

@@ -26,10 +26,8 @@ from orthaug._base.parallel import one_blas_thread
 
 _ROWS = 2000  # that are used, spread over the record
 _FEWEST = 60  # rows; of fewer no mean given the features is known
-_FOLDS, _BLOCKS = (
-    5,
-    40,
-)  # rows of a block are predicted by those of other folds: neighbours in time are alike
+# Rows of a block are predicted by those of other folds: neighbours in time are alike
+_FOLDS, _BLOCKS = (5, 40)
 _WAVES = 60
 _STEPS = 15  # of each feature, at its quantiles
 _STEEPEST = 30.0  # slope of a wave, in units of 1 / half of the range
@@ -38,9 +36,8 @@ _RIDGES = (1e-8, 1e-5, 1e-2)  # of the mean square of a function
 _MARGIN = 1.5  # times what M leaves of known functions
 _LEAST, _MOST = 1e-4, 0.1  # between which that limit is taken
 _PROBES = 6  # of each kind
-_SMALL = (
-    0.1  # of a direction's size: entries below it are left out where the direction stays shared
-)
+# Of a direction's size: entries below it are left out where the direction stays shared
+_SMALL = 0.1
 _SEED = 20_261_124
 
 
@@ -199,9 +196,8 @@ class _Smoother:
         nz = z.shape[1]
         for j in range(nz):
             at = np.quantile(z[:, j], np.linspace(0, 1, _STEPS + 2)[1:-1])
-            steps = (z[:, j, None] > np.append(at, 0.0)).astype(
-                float
-            )  # most jumps of physics are at zero
+            # Most jumps of physics are at zero
+            steps = (z[:, j, None] > np.append(at, 0.0)).astype(float)
             parts += [steps, scaled[:, j, None] ** np.arange(2, 5), np.abs(z[:, j, None])]
             parts += [scaled[:, [j]] * scaled[:, [i]] for i in range(j)]
         fold = (np.arange(n) * min(_BLOCKS, n) // n) % _FOLDS

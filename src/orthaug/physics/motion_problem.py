@@ -24,12 +24,10 @@ from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
-_TURNED = (
-    100.0  # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
-)
-_GONE = (
-    -5.0
-)  # real part times the sampling time: of an oscillation less than 1 % is left at the next sample
+# [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
+_TURNED = 100.0
+# Real part times the sampling time: of an oscillation less than 1 % is left at the next sample
+_GONE = -5.0
 _FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial

@@ -17,10 +17,8 @@ from orthaug._base.checks import Matrix, Vector, check_choice
 from orthaug._base.errors import InputError, show
 
 CHOICES = ("auto", "none", "std", "covariance")
-_SMALLEST, _LARGEST = (
-    1e-12,
-    1e12,
-)  # of one weight against another: beyond, an output does not count at all
+# Of one weight against another: beyond, an output does not count at all
+_SMALLEST, _LARGEST = (1e-12, 1e12)
 
 
 @dataclass(frozen=True, eq=False)

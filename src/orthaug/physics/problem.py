@@ -33,9 +33,8 @@ from orthaug.physics.output_weights import OutputWeights, check_output_weights, 
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import Shared, shared_directions
 
-_LARGEST = (
-    1e120  # size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
-)
+# Size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
+_LARGEST = 1e120
 
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 

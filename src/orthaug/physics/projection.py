@@ -36,9 +36,8 @@ class Factor:
         """
         r = scale = None
         for block in blocks:
-            rows = block.reshape(
-                block.shape[0] * block.shape[1], block.shape[2]
-            )  # −1 has no meaning without columns
+            # −1 has no meaning without columns
+            rows = block.reshape(block.shape[0] * block.shape[1], block.shape[2])
             if scale is None or r is None:
                 scale, r = _scale(rows), np.zeros((0, rows.shape[1]))
             r = np.asarray(np.linalg.qr(np.concatenate([r, rows * scale]), mode="r"))

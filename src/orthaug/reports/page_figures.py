@@ -25,9 +25,8 @@ from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
 
 _ROW = 62  # pixels of a parameter
-_NAMED = (
-    0.8  # height of its name on an axis from -1 to 1: between the numbers of its axis and the last
-)
+# Height of its name on an axis from -1 to 1: between the numbers of its axis and the last
+_NAMED = 0.8
 _FAR = 6.0  # widths of an interval from which the initial value is not drawn
 _DECADES = 20.0  # ratio of scores from which their axis is logarithmic
 _BAD = 1.0  # NRMSE of the mean, from which it is too

@@ -19,10 +19,8 @@ from orthaug.reports.page_blocks import Plot, area, number, percent
 
 MOST_POINTS = 100_000  # of a curve
 _BUDGET = 560_000  # points of a page: three million letters
-_UPPER, _GAP = (
-    0.64,
-    0.05,
-)  # share of a pair of panels that is the upper one, and what lies between panels
+# Share of a pair of panels that is the upper one, and what lies between panels
+_UPPER, _GAP = (0.64, 0.05)
 _MOST_SHADES = 200  # areas of a plot
 _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")

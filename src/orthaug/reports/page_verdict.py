@@ -30,10 +30,8 @@ _MOST_DOUBTS = 3  # in the first sentence
 _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _RAN_AWAY = "free_run_diverged"
-_TIED = (
-    "orthogonal",
-    "physics alone",
-)  # of models that are as good as each other these are taken first
+# Of models that are as good as each other these are taken first
+_TIED = ("orthogonal", "physics alone")
 
 
 class PageVerdict(NamedTuple):

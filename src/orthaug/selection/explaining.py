@@ -142,9 +142,8 @@ _PLAIN = ("coulomb", "quadratic_drag", "cubic", "square_root")
 _WIDE = tuple(
     kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS
 )
-_WIDTHS = tuple(
-    2.0 ** (i / 2) for i in range(-8, 3)
-)  # times the median size of what a term acts on
+# Times the median size of what a term acts on
+_WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))
 _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
 _COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {
     "stribeck": 3,
@@ -153,10 +152,8 @@ _COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {
     "saturation": 4,
 }
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
-_TIE, _TIE_UNKNOWN = (
-    2e-4,
-    2e-3,
-)  # share of the learner: within this of the best the simpler term is taken
+# Share of the learner: within this of the best the simpler term is taken
+_TIE, _TIE_UNKNOWN = (2e-4, 2e-3)
 _PART = 0.1  # of what even the best leaves: less does not separate two terms either
 # Variances of the noise in one direction: what two terms with widths differ by at random
 _DRAWS = 10.0

@@ -19,9 +19,8 @@ from orthaug.selection.term_runs import Able, Point, TermRuns
 
 MOVED, SPANNED = "physics_moved", "terms_within_span"
 _SURE = 1.96  # standard errors
-_DETERMINED = (
-    1e-14  # of the largest eigenvalue: columns whose smallest is below depend on each other
-)
+# Of the largest eigenvalue: columns whose smallest is below depend on each other
+_DETERMINED = 1e-14
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ _PATIENCE = 5
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice
-_SURE, _HALF = (
-    3.0,
-    0.5,
-)  # standard errors, and of the error of physics alone: what is better by both is confirmed
+# Standard errors, and of the error of physics alone: what is better by both is confirmed
+_SURE, _HALF = (3.0, 0.5)
 _HALVES = 50  # random halves of the data over which terms are chosen again
 _PARTS = 10  # of the training data, that halves are made of
 _SEED = 20_261_122

@@ -31,9 +31,8 @@ class Spread(NamedTuple):
     runs: int
 
     def __str__(self) -> str:
-        digits = (
-            3 if self.high - self.low > 0.01 * self.mean else 6
-        )  # as many as make low and high differ
+        # As many as make low and high differ
+        digits = 3 if self.high - self.low > 0.01 * self.mean else 6
         return f"{self.mean:.{digits}g} ({self.low:.{digits}g} … {self.high:.{digits}g})"
 
     def scaled(self, factor: float) -> Spread:

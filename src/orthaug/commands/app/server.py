@@ -78,9 +78,8 @@ def serve(spec: Path | None, *, port: int | None = None, browser: bool = True) -
     """
     listening = free_port(port)
     with listening, private_folder() as folder:
-        os.environ["NICEGUI_STORAGE_PATH"] = str(
-            folder / "storage"
-        )  # else it would keep one in the working folder
+        # Else it would keep one in the working folder
+        os.environ["NICEGUI_STORAGE_PATH"] = str(folder / "storage")
         check_installed()
         from orthaug.commands.app.spec_text import in_file
 

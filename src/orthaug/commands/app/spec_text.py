@@ -19,13 +19,8 @@ from tomlkit.items import AoT
 from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
-_WORDS = (
-    "parameter",
-    "regressor",
-    "output",
-    "unit",
-    "channel",
-)  # keys whose values are text, digits or not
+# Keys whose values are text, digits or not
+_WORDS = ("parameter", "regressor", "output", "unit", "channel")
 _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 

@@ -34,10 +34,8 @@ from orthaug.data.record import check_step
 
 _STEPS = ("data", "prepare")
 _LISTED = 40  # columns
-_COLUMNS = (
-    "input ",
-    "output ",
-)  # beginnings of lines on columns, which the page shows elsewhere
+# Beginnings of lines on columns, which the page shows elsewhere
+_COLUMNS = ("input ", "output ")
 _DRAFT = ("first physics", "test:")  # of lines on a spec for the file
 _OFFERED = 5  # specs of earlier work
 _USES = {"": "leave out", "input": "input", "output": "output"}

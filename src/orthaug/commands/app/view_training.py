@@ -72,9 +72,8 @@ class TrainingView:
         self.follow_check()
         self.end.set_visibility(running is not None)
         self.end.set_enabled(running is not None and not running.stopping)
-        able = (
-            running is not None and running.arguments[0] == "fit"
-        )  # half a comparison compares nothing
+        # Half a comparison compares nothing
+        able = running is not None and running.arguments[0] == "fit"
         self.finish.set_visibility(able)
         self.finish.set_enabled(
             running is not None

@@ -227,9 +227,8 @@ def minimise_by_engine(
     first = normal_at(w, overlap) if state is None else None  # compiles: no time of the run
     began = training_clock()
     if first is not None:
-        state = _first_state(
-            w, normal_at(w, first.overlap), start
-        )  # less what rounding left of J in the physics
+        # Less what rounding left of J in the physics
+        state = _first_state(w, normal_at(w, first.overlap), start)
     assert state is not None
     enough = False
     while settings.runs(state) and not enough:

@@ -42,9 +42,8 @@ class Damping(NamedTuple):
     diagonal: bool
 
 
-IDENTITY = Damping(
-    1e-5, 1e12, diagonal=False
-)  # docs/design.md has the comparison of first dampings
+# Docs/design.md has the comparison of first dampings
+IDENTITY = Damping(1e-5, 1e12, diagonal=False)
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 
 
@@ -370,9 +369,8 @@ def _step(
     curvature = np.diag(hessian)[free] if kind.diagonal else np.ones(len(free))
     scale = np.maximum(curvature, _SMALLEST_CURVATURE * curvature.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    unit = 1 / np.sqrt(
-        scale
-    )  # solved with a unit diagonal: columns of very different size keep their digits
+    # Solved with a unit diagonal: columns of very different size keep their digits
+    unit = 1 / np.sqrt(scale)
     matrix = hessian[np.ix_(free, free)] * np.outer(unit, unit) + damping * np.eye(len(free))
     step = np.zeros(len(p))
     if not len(free):
