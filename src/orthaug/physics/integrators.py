@@ -85,7 +85,7 @@ class Exponentials(NamedTuple):
 
 @dataclass(frozen=True)
 class Integrator:
-    """How a motion goes on by one substep; a new one is a subclass in `INTEGRATORS`.
+    """Rule by which a motion goes on by one substep; a new one is a subclass in `INTEGRATORS`.
 
     Arithmetic alone, so that the arrays may be JAX's or NumPy's. Derivatives are automatic.
     """
