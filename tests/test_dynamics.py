@@ -13,7 +13,7 @@ import pytest
 from orthaug import MLP, Baseline, Lags, Record, Term
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers, Parts
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import pose
 
@@ -21,7 +21,7 @@ from orthaug.physics.problem import pose
 
 
 @dataclass(frozen=True)
-class Generic(AutodiffDynamics, Lagged):
+class Generic(AutodiffDynamics, LaggedDynamics):
     """The lagged form by automatic differentiation of its step."""
 
 
@@ -55,7 +55,7 @@ def form_of(name):
     posed = pose(record, Baseline.from_terms(terms), lags)
     nz, nt = posed.feature_rows().shape[1], len(posed.baseline.names)
     bound = None if learner is None else Bound(learner, nz, ny)
-    form = Lagged(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
+    form = LaggedDynamics(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
     w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
     scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     return form, Numbers(0.4 * rng.normal(size=nt), 0.3 * rng.normal(size=nt), w, *scaling), record

@@ -33,7 +33,7 @@ from orthaug.export.numpy_step import FUNCTIONS as NUMPY_FUNCTIONS
 from orthaug.export.numpy_step import NumpyStep
 from orthaug.models.beyond import pull_of
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.moving import MotionDynamics
 
@@ -78,7 +78,7 @@ def lagged(terms, features, learner, outputs, inputs, constants=None) -> Model:
     scaling = (0.2 * rng.normal(size=nz), 1 + rng.random(nz), 0.2 * (1 + rng.random(ny)))
     numbers = Numbers(0.3 * rng.normal(size=nt), 0.1 * rng.normal(size=nt), weights, *scaling)
     return Model(
-        form=Lagged(baseline, Features(entries), layout, outputs, bound),
+        form=LaggedDynamics(baseline, Features(entries), layout, outputs, bound),
         numbers=numbers,
         outputs=tuple(oa.Channel(name, "m") for name in outputs),
         inputs=tuple(oa.Channel(name, "N") for name in inputs),
@@ -215,10 +215,14 @@ MODELS: dict[str, Callable[[], Model | MotionModel]] = {
 def limited(model):
     """The same with a correction that is held, or fades, beyond half of what the tests reach."""
     form, nz = model.form, len(model.numbers.centre)
-    n = len(form.layout) if isinstance(form, Lagged) else form.states + len(form.motion.inputs)
+    n = (
+        len(form.layout)
+        if isinstance(form, LaggedDynamics)
+        else form.states + len(form.motion.inputs)
+    )
 
     def features(points):
-        if isinstance(form, Lagged):
+        if isinstance(form, LaggedDynamics):
             return np.asarray(form.features.evaluate(points, form.layout, np))
         return np.asarray(form.seen(points[:, : form.states].T, points[:, form.states :].T, np)).T
 

@@ -13,7 +13,7 @@ from test_cli import make_project, run
 import orthaug as oa
 from orthaug import InputError
 from orthaug.data.preparation import steps_again, warnings_of
-from orthaug.data.prepared import Prepared
+from orthaug.data.prepared import Preparation
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -390,9 +390,9 @@ def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimate
 
 
 def test_instants_are_resampled_as_those_of_the_training_data():
-    resampled = Prepared("resample", {"method": "linear"})
+    resampled = Preparation("resample", {"method": "linear"})
     steps, step = steps_again(
-        [resampled, Prepared("decimate", {"factor": 5, "phase": "zero"})], ["u"], 0.1
+        [resampled, Preparation("decimate", {"factor": 5, "phase": "zero"})], ["u"], 0.1
     )
     assert steps == (oa.Resample(sampling_time=0.02), oa.Decimate(factor=5)) and step == 0.02
 

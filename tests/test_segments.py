@@ -17,7 +17,7 @@ import orthaug.fitting.segments
 from orthaug import MLP, Baseline, Lags, LevenbergMarquardt, Record, Term, estimate
 from orthaug.fitting.segments import Segments, build_segments, respond, sensitivity
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import pose
 
@@ -69,7 +69,7 @@ class Case(NamedTuple):
     """A model with arbitrary numbers, its record in two chunks of segments, and states that are not the measured."""
 
     record: Record
-    form: Lagged
+    form: LaggedDynamics
     numbers: Numbers
     segments: Segments
     states: np.ndarray
@@ -86,7 +86,7 @@ def case(name):
     )
     nz = posed.feature_rows().shape[1]
     bound = None if learner is None else Bound(learner, nz, ny)
-    form = Lagged(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
+    form = LaggedDynamics(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
     w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
     c = 0.4 * rng.normal(size=len(posed.baseline.names))
     scaling = (np.zeros(0), np.zeros(0), np.zeros(ny))

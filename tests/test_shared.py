@@ -37,7 +37,7 @@ from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
 from orthaug.physics.left_over import left_over
 from orthaug.physics.problem import pose
-from orthaug.physics.shared import Shared, shared_directions
+from orthaug.physics.shared import SharedDirections, shared_directions
 
 LAYOUT = Lags(2, 1, 1).layout(("y",), ("u",))
 LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "u[k-1]")])
@@ -101,7 +101,9 @@ def test_directions_that_leave_some_entries_where_they_are(seed):
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-6, 6, 6)
     drawn = size[:, None] * rng.normal(size=(6, 4))
-    found = Shared(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).without_entries([1, 5])
+    found = SharedDirections(tuple("abcdef"), drawn @ np.linalg.inv(drawn[:4])).without_entries(
+        [1, 5]
+    )
     expected = drawn @ scipy.linalg.null_space((drawn / size[:, None])[[1, 5]])
     both = np.column_stack([found.basis, expected]) / size[:, None]
     assert found.basis.shape == (6, 2) and not found.basis[[1, 5]].any()

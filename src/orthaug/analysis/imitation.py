@@ -18,7 +18,7 @@ from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
-from orthaug.physics.shared import Shared, shared_directions
+from orthaug.physics.shared import SharedDirections, shared_directions
 
 _STILL = 1e-8  # change of a physical parameter along a shared direction, relative: rounding
 _ALTERNATIVES = 8
@@ -37,7 +37,10 @@ class Alternative:
 
     @classmethod
     def of(
-        cls, inputs: tuple[str, ...], shared: Shared, physical: tuple[str, ...] | None = None
+        cls,
+        inputs: tuple[str, ...],
+        shared: SharedDirections,
+        physical: tuple[str, ...] | None = None,
     ) -> Alternative:
         return cls(inputs, shared.basis.shape[1], shared.untouched, physical)
 
@@ -67,7 +70,7 @@ class Imitation:
     """
 
     @classmethod
-    def of(cls, inputs: Sequence[str], shared: Shared, *others: Any) -> Self:
+    def of(cls, inputs: Sequence[str], shared: SharedDirections, *others: Any) -> Self:
         """Return the imitation for the shared directions; `others` are the last fields."""
         return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
 
@@ -228,7 +231,7 @@ def _slopes(problem: Problem, physics: PhysicsMap | None) -> dict[str, np.ndarra
 
 
 def _unmoved_parameters(
-    shared: Shared, slopes: dict[str, np.ndarray] | None
+    shared: SharedDirections, slopes: dict[str, np.ndarray] | None
 ) -> tuple[str, ...] | None:
     """Return the physical parameters that no shared direction moves."""
     if slopes is None:

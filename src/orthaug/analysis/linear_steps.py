@@ -19,7 +19,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences
 from orthaug.fitting.segmented_motion import LOOSE
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import MotionDynamics
@@ -32,7 +32,7 @@ _WIDTH = 1e-3  # of differences, in sizes: bears a learner in single precision
 class LaggedStep:
     """The step of a lagged model; it rests where an output repeats itself."""
 
-    form: Lagged
+    form: LaggedDynamics
     memory: Memory
 
     ends = 1  # how many instants' inputs a step reads

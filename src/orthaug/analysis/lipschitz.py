@@ -17,7 +17,7 @@ from orthaug.analysis.feedback import by_differences, difference_width
 from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, even_indices, positive, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 
 _BATCH = 1024  # rows per compiled call
@@ -76,7 +76,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
-    if not isinstance(form := model.form, Lagged):
+    if not isinstance(form := model.form, LaggedDynamics):
         return None
     stacked, every, y_scale = _measured_regressors(model, record, x)
     some = even_indices(len(every), MOST_STEPS)
@@ -129,7 +129,7 @@ def _measured_regressors(
     return x, RowIndex.of(lengths, form.first_row), positive(outputs.std(axis=0))
 
 
-def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:
+def _gradients(form: LaggedDynamics, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:
     """Yield ∂g/∂x and ∂φ/∂x at regressors (m, nx), in batches of one shape."""
     width = difference_width(x)
     for begin in range(0, len(x), _BATCH):
@@ -141,7 +141,7 @@ def _gradients(form: Lagged, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]
 
 @partial(jax.jit, static_argnames="form")
 def _gradient_rows(
-    form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], width: Any
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Any
 ) -> tuple[Array, Array]:
     """Return ∂g/∂x (m, ny, nx) and ∂φ/∂x, by differences of `width` (nx,) without a derivative."""
 
@@ -156,7 +156,7 @@ def _gradient_rows(
 
 
 def _weight_sizes(
-    form: Lagged, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
+    form: LaggedDynamics, numbers: Numbers, x: Matrix, x_scale: Vector, y_scale: Vector
 ) -> tuple[Int[np.ndarray, "r"], Vector, Vector]:
     """Return the affordable rows of x (m, nx), and ‖∂²g/∂w∂x‖ there: plain (r,), scaled."""
     cells, directions = len(form.outputs) * np.size(numbers.weights), np.eye(x.shape[1])
@@ -179,7 +179,7 @@ def _weight_sizes(
 
 @partial(jax.jit, static_argnames="form")
 def _weight_squares(
-    form: Lagged, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
 ) -> Float[Array, "m ny"]:
     """Return Σ_w (∂²g/∂w∂x)² along one direction of x."""
 

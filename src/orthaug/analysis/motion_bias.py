@@ -43,7 +43,7 @@ from orthaug.inference.motion_split import (
 from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
-from orthaug.physics.shared import Shared, moves
+from orthaug.physics.shared import SharedDirections, moves
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
 # Of a measure at most, over which certificates and terms of each equation are sought
@@ -139,7 +139,7 @@ class MotionLinearization:
 
     place: FreeRunPoint
     q: Vector
-    shared: Shared
+    shared: SharedDirections
     field: Field
     learned: Matrix | None = None
     unknown: tuple[str, ...] = ()
@@ -483,7 +483,9 @@ def linearize_physics(task: MotionTask, structure: Structure) -> MotionLineariza
         point.states,
     )[0]
     if structure.shared == "all":
-        return MotionLinearization(place, point.theta, Shared(names, np.eye(len(names))), field)
+        return MotionLinearization(
+            place, point.theta, SharedDirections(names, np.eye(len(names))), field
+        )
     return MotionLinearization(
         place, point.theta, shared_of_motion(form, point.theta, field.x, field.u), field
     )

@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt
 from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.registry import OneOf, Registry, check_fields
-from orthaug.data.prepared import Prepared
+from orthaug.data.prepared import Preparation
 from orthaug.data.record import Experiment, Record, same_step, unbroken
 from orthaug.data.steps import Channels, Detrend, Fill, Outliers, Resample, Run, Shift, Step
 
@@ -224,7 +224,7 @@ def check_steps(steps: Any) -> None:
 
 def prepared_experiments(
     runs: Iterable[tuple[Run, Experiment]], steps: Sequence[Step], *, keep: bool = False
-) -> tuple[tuple[Experiment, ...], float, tuple[Prepared, ...], int]:
+) -> tuple[tuple[Experiment, ...], float, tuple[Preparation, ...], int]:
     """Return the experiments after the steps, with their sampling time and an account.
 
     The account is what was done, and how many rows are left out as missing.
@@ -277,8 +277,8 @@ class _Account:
             self.marked += int((old & ~new).sum())
             self.filled += int((new & ~old).sum())
 
-    def prepare(self) -> Prepared:
-        return Prepared(self.kind, _options_of(self.step), self.marked + self.filled)
+    def prepare(self) -> Preparation:
+        return Preparation(self.kind, _options_of(self.step), self.marked + self.filled)
 
 
 def _options_of(step: Any) -> dict[str, Any]:
@@ -315,7 +315,7 @@ def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:
 
 
 def steps_again(
-    prepared: Sequence[Prepared], names: Sequence[str], sampling_time: float
+    prepared: Sequence[Preparation], names: Sequence[str], sampling_time: float
 ) -> tuple[tuple[Step, ...], float]:
     """Return the steps that prepare a new record as another one was.
 
@@ -342,7 +342,7 @@ def steps_again(
     return tuple(steps), sampling_time
 
 
-def warnings_of(prepared: Sequence[Prepared], names: Sequence[str]) -> tuple[Warning, ...]:
+def warnings_of(prepared: Sequence[Preparation], names: Sequence[str]) -> tuple[Warning, ...]:
     """Return warnings about a fit to data that were prepared so."""
     found = []
     for done in prepared:

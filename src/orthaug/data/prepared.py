@@ -10,7 +10,7 @@ from orthaug._base.errors import InputError
 
 
 @dataclass(frozen=True)
-class Prepared:
+class Preparation:
     """A step of preparation: its kind, its options, and how many samples it changed.
 
     Changed samples were marked as missing or filled.
@@ -35,12 +35,12 @@ class Prepared:
         samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
         return f"{self.named}: {samples} {done}" if done else self.named
 
-    def with_samples(self, samples: int) -> Prepared:
+    def with_samples(self, samples: int) -> Preparation:
         """Return the step with another number of samples."""
         return replace(self, samples=samples)
 
 
-def added_up(prepared: Sequence[tuple[Prepared, ...]]) -> tuple[Prepared, ...]:
+def added_up(prepared: Sequence[tuple[Preparation, ...]]) -> tuple[Preparation, ...]:
     """Return the steps of records that are joined, with the sums of their samples.
 
     All went through the same steps.

@@ -20,7 +20,7 @@ from orthaug._base.checks import (
 from orthaug._base.errors import LONGEST, InputError, show, visible
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
-from orthaug.data.prepared import Prepared, added_up
+from orthaug.data.prepared import Preparation, added_up
 
 LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
@@ -212,7 +212,7 @@ class Record(NotebookView):
     """Rows that were left out because a sample was missing: 0 unless it was read with
     `missing="skip"` or prepared.
     """
-    prepared: tuple[Prepared, ...] = ()
+    prepared: tuple[Preparation, ...] = ()
     """Preparation of the samples, in order."""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identi
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.beyond import FADED
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.model import Model
 from orthaug.models.motion_field import MotionField
@@ -42,7 +42,7 @@ class FadeNodes:
     @classmethod
     def of(
         cls,
-        form: Lagged | MotionField,
+        form: LaggedDynamics | MotionField,
         numbers: Numbers,
         features: Sequence[Node],
         points: Sequence[Node],

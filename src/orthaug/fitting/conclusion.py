@@ -35,7 +35,7 @@ from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, t
 from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound, External, Function, Scaling
 from orthaug.models.model import Model
 from orthaug.models.statistics import JointCovariance, Statistics
@@ -139,7 +139,7 @@ def _model(
     middle = _middle(problem, learned, noise)
     decoupled = structure.projects and directions(structure, problem) is None
     held = {} if decoupled else parameters.fixed
-    form = Lagged(
+    form = LaggedDynamics(
         problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound
     )
     limits, pull = _limits(problem, form)
@@ -167,7 +167,7 @@ def _model(
     )
 
 
-def _limits(problem: Problem, form: Lagged) -> tuple[Matrix | None, Matrix | None]:
+def _limits(problem: Problem, form: LaggedDynamics) -> tuple[Matrix | None, Matrix | None]:
     """Return the range of the features, and how x follows its limits.
 
     Beyond the range the correction stays constant or fades.

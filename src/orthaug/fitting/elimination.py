@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.structures import PenaltyRows, Structure
 from orthaug.physics.problem import Problem
-from orthaug.physics.shared import Shared
+from orthaug.physics.shared import SharedDirections
 
 Fixed = dict[int, float]
 """Entries of θ at a bound, with its value."""
@@ -56,7 +56,7 @@ class Elimination:
     rows: PenaltyRows
     lower: Vector
     upper: Vector
-    shared: Shared | None = None
+    shared: SharedDirections | None = None
     """The directions that P projects onto; None where P is the same whichever entries are at a
     bound.
     """
@@ -212,9 +212,11 @@ def eliminate(structure: Structure, problem: Problem) -> Elimination:
     )
 
 
-def _shared_directions(structure: Structure, problem: Problem) -> Shared:
+def _shared_directions(structure: Structure, problem: Problem) -> SharedDirections:
     names = problem.baseline.names
-    return Shared(names, np.eye(len(names))) if structure.shared == "all" else problem.shared
+    return (
+        SharedDirections(names, np.eye(len(names))) if structure.shared == "all" else problem.shared
+    )
 
 
 def directions(structure: Structure, problem: Problem, fixed: Iterable[int] = ()) -> Matrix | None:

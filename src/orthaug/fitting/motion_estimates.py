@@ -29,7 +29,7 @@ from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
 from orthaug.physics.motion_problem import MotionProblem, layout_of
-from orthaug.physics.shared import Shared
+from orthaug.physics.shared import SharedDirections
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,7 +100,7 @@ class MotionEstimate(AnyFit):
         return self.model.reach(record)
 
     @property
-    def shared(self) -> Shared:
+    def shared(self) -> SharedDirections:
         """The directions of the parameters' coordinates that the learner could imitate."""
         return self.split_by.shared
 
@@ -399,7 +399,7 @@ def _doubts(
     return warnings
 
 
-def shared_in_words(shared: Shared) -> str:
+def shared_in_words(shared: SharedDirections) -> str:
     """Return the directions that the learner could imitate, in words."""
     if not shared.basis.size:
         return "nothing: the data determine all parameters"

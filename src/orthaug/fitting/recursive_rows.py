@@ -21,7 +21,7 @@ from orthaug.fitting.recursion import Recursion, inflation_of, squares, start_re
 from orthaug.fitting.residual_band import Reference
 from orthaug.inference.covariance import newey_west, whitening_matrix
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.motion_model import MotionModel
 from orthaug.physics.output_weights import times
@@ -31,7 +31,9 @@ _RIM = 1e-9  # the largest of training is no extrapolation
 
 
 @partial(jax.jit, static_argnames="form")
-def _evaluate(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Float[Array, "m ny ntp"]:
+def _evaluate(
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"]
+) -> Float[Array, "m ny ntp"]:
     """Return `[φ, known + f − φθ_aux]` of every row, and the largest of its scaled features.
 
     That is 1 at the limit of the training data.

@@ -19,7 +19,7 @@ from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
 from orthaug.fitting.segments import build_segments
 from orthaug.fitting.solvers.descent import Descent
 from orthaug.fitting.structures import Structure
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
 from orthaug.physics.problem import Problem
 
@@ -27,10 +27,12 @@ from orthaug.physics.problem import Problem
 _SMALL = 4096
 
 
-def lagged_dynamics(task: OneStepTask) -> Lagged:
+def lagged_dynamics(task: OneStepTask) -> LaggedDynamics:
     """Return the dynamics of a problem and its learner."""
     problem = task.problem
-    return Lagged(problem.baseline, problem.features, problem.layout, problem.outputs, task.bound)
+    return LaggedDynamics(
+        problem.baseline, problem.features, problem.layout, problem.outputs, task.bound
+    )
 
 
 def declared_settings(task: OneStepTask, criterion: Criterion) -> dict[str, Any]:
@@ -56,7 +58,7 @@ def declared_settings(task: OneStepTask, criterion: Criterion) -> dict[str, Any]
 class SegmentedLagged(SegmentedProblem):
     """A problem in segments, beside its rows for one step."""
 
-    dynamics: Lagged
+    dynamics: LaggedDynamics
     task: OneStepTask
     fixed: Fixed = field(default_factory=dict)
     """Entries of an orthogonal θ that are known to be at a bound beside the learner."""

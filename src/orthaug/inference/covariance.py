@@ -24,7 +24,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.rows import (
     InMemory,
@@ -228,7 +228,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 
 @partial(jax.jit, static_argnames="form")
 def _variances(
-    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ny m"]:
     return jax.lax.map(
         lambda rows: jnp.sum(_slopes_along(form, numbers, rows, root) ** 2, axis=0), x
@@ -237,7 +237,7 @@ def _variances(
 
 @partial(jax.jit, static_argnames="form")
 def changes(
-    form: Lagged, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "k nx m"], root: Float[Array, "n r"]
 ) -> Float[Array, "k ro m"]:
     """Return how far each prediction moves along the columns of `root`."""
 
@@ -248,7 +248,9 @@ def changes(
     return jax.lax.map(one_chunk, x)
 
 
-def _slopes_along(form: Lagged, numbers: Numbers, rows: Any, root: Any) -> Float[Array, "r ny m"]:
+def _slopes_along(
+    form: LaggedDynamics, numbers: Numbers, rows: Any, root: Any
+) -> Float[Array, "r ny m"]:
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)

@@ -28,7 +28,7 @@ from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.left_over import UnexplainedPhysics, left_over
 from orthaug.physics.motion import Motion
-from orthaug.physics.shared import Shared, agreeing_directions, moves, spanned_directions
+from orthaug.physics.shared import SharedDirections, agreeing_directions, moves, spanned_directions
 
 _BATCH = 4096  # points at a time
 _ITERATIONS = 30
@@ -61,7 +61,7 @@ class MotionSplit:
 
     name: str
     q: Vector
-    shared: Shared
+    shared: SharedDirections
     slope: Matrix | None
     defect: float | None
     """‖projection of the rest on the shared directions‖ / ‖g‖ over the measure."""
@@ -83,11 +83,11 @@ class MotionSplit:
             np.zeros(0),
             np.zeros(0),
         )
-        shared = Shared(form.motion.names, np.zeros((len(c), 0)))
+        shared = SharedDirections(form.motion.names, np.zeros((len(c), 0)))
         return cls(name, c, shared, None, None, None, 1.0, nothing)
 
 
-def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> SharedDirections:
     """Return the directions of q that a learner on these features could imitate, at q.
 
     A direction is shared if it moves no equation and no output without a learner, and moves those
@@ -95,7 +95,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     """
     names, motion = form.motion.names, form.motion
     if not learned_places(motion):
-        return Shared(names, np.zeros((len(names), 0)))
+        return SharedDirections(names, np.zeros((len(names), 0)))
     if form.bound is not None and getattr(form.bound.learner, "linear", False):
         return _spanned_directions(form, q, x, u)
     nx = x.shape[1]
@@ -121,7 +121,9 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     before, after = (
         np.concatenate(list(np.moveaxis(part / size, 1, 0))) for part in (before, after)
     )
-    return Shared(names, agreeing_directions(before, after)).beside(_left_over(form, q, points, nx))
+    return SharedDirections(names, agreeing_directions(before, after)).beside(
+        _left_over(form, q, points, nx)
+    )
 
 
 def _left_over(
@@ -134,7 +136,7 @@ def _left_over(
     return left_over(slopes, features, _has_learner(form.motion))
 
 
-def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Shared:
+def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> SharedDirections:
     """Return the directions that the learner's features span and that move no other equation."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
@@ -159,7 +161,7 @@ def nearest(
     field: Field,
     bounds: tuple[Vector, Vector],
     basis: Matrix | None = None,
-) -> tuple[Vector, Shared]:
+) -> tuple[Vector, SharedDirections]:
     """Return q̂, which differs from c along shared directions only.
 
     The search begins at the point of that plane that is nearest to `start`.
@@ -171,9 +173,9 @@ def nearest(
     c = np.asarray(numbers.theta - numbers.theta_aux)
     q = c
 
-    def directions(q: Vector) -> Shared:
+    def directions(q: Vector) -> SharedDirections:
         if basis is not None:
-            return Shared(form.motion.names, basis)
+            return SharedDirections(form.motion.names, basis)
         return shared_of_motion(form, q, field.x, field.u)
 
     shared = directions(q)
@@ -237,7 +239,7 @@ def split_motion(
     basis = np.eye(count) if everything else None
     c = np.asarray(numbers.theta - numbers.theta_aux)
     if form.bound is None:
-        nothing = Shared(form.motion.names, np.zeros((count, 0)))
+        nothing = SharedDirections(form.motion.names, np.zeros((count, 0)))
         return MotionSplit(name, c, nothing, np.eye(count), None, None, 1.0, field)
     q, shared = nearest(form, numbers, start, field, bounds, basis)
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)

@@ -15,14 +15,14 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.models.statistics import JointCovariance, Statistics
-from orthaug.physics.shared import Shared
+from orthaug.physics.shared import SharedDirections
 
 # share of a direction's squares below which it is split off, and has the variance of the split
 _NOTHING = 1e-3
 
 
 def enlarge_covariance(
-    covariance: Matrix | None, statistics: Statistics, shared: Shared | None
+    covariance: Matrix | None, statistics: Statistics, shared: SharedDirections | None
 ) -> Matrix | None:
     """Return Cov θ̂ (nθ, nθ), larger along directions that the features leave little of.
 
@@ -56,7 +56,7 @@ def enlarge_covariance(
     return covariance + more * np.outer(unit, unit)
 
 
-def shared_warnings(shared: Shared | None, inputs: Sequence[str]) -> list[Warning]:
+def shared_warnings(shared: SharedDirections | None, inputs: Sequence[str]) -> list[Warning]:
     """Return warnings where the rows contradict directions that the names call determined.
 
     Args:

@@ -24,7 +24,7 @@ from orthaug.models.kalman import (
     slope,
     without_gaps,
 )
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
 
@@ -40,7 +40,7 @@ class LaggedFilter:
     that of `predict`.
     """
 
-    form: Lagged
+    form: LaggedDynamics
     memory: Memory
 
     hidden = False

@@ -28,7 +28,7 @@ from orthaug.physics.baseline import Baseline
 
 
 @dataclass(frozen=True)
-class Lagged:
+class LaggedDynamics:
     """Computations of a model of lagged signals, without its numbers: `Dynamics`."""
 
     baseline: Baseline
@@ -38,7 +38,7 @@ class Lagged:
     bound: Bound | None
 
     @property
-    def physics_only(self) -> Lagged:
+    def physics_only(self) -> LaggedDynamics:
         """These dynamics without the learner."""
         return replace(self, features=Features(()), bound=None)
 

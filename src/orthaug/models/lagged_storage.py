@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.regressors import Features
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
 from orthaug.models.model_arrays import (
@@ -77,7 +77,9 @@ def rebuild(
     )
     features = Features(entries, bound is not None and getattr(bound.learner, "linear", False))
     names = tuple(channel["name"] for channel in declared["outputs"])
-    form = Lagged(baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound)
+    form = LaggedDynamics(
+        baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound
+    )
     return Model(
         form=form,
         **fields_from(declared, arrays),

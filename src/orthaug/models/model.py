@@ -14,11 +14,11 @@ from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.views import NotebookView
-from orthaug.data.record import Channel, Experiment, Prepared, Record
+from orthaug.data.record import Channel, Experiment, Preparation, Record
 from orthaug.models.beyond import outside
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.filters import LaggedFilter
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.on_records import WITHIN, RecordModel, trajectory
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
@@ -30,7 +30,7 @@ _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 
 
 @partial(jax.jit, static_argnames="form")
-def _predict_rows(form: Lagged, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
+def _predict_rows(form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
     return jax.vmap(lambda row: form.at(numbers, row))(x)
 
 
@@ -85,7 +85,7 @@ class Model(RecordModel, NotebookView):
         array([[nan, 2.5, 0.5]])
     """
 
-    form: Lagged
+    form: LaggedDynamics
     numbers: Numbers
     outputs: tuple[Channel, ...]
     inputs: tuple[Channel, ...]
@@ -99,7 +99,7 @@ class Model(RecordModel, NotebookView):
     """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
-    prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
+    prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
 
     def __repr__(self) -> str:

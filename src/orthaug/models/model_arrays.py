@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.registry import freeze
-from orthaug.data.record import Channel, Prepared
+from orthaug.data.record import Channel, Preparation
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Bound, Learner
@@ -44,7 +44,7 @@ def fields_from(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict
     channels = {kind: tuple(Channel(**c) for c in declared[kind]) for kind in ("outputs", "inputs")}
     numbers = {"numbers": numbers_from(arrays), "statistics": statistics_from(arrays, declared)}
     fields = {name: declared[name] for name in _SAID} | channels | numbers
-    prepared = tuple(Prepared(**step) for step in declared.get("prepared", ()))
+    prepared = tuple(Preparation(**step) for step in declared.get("prepared", ()))
     return fields | {"largest_output": arrays["largest_output"], "prepared": prepared}
 
 

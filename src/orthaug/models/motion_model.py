@@ -19,7 +19,7 @@ from orthaug._base.checks import Matrix, Vector, as_signal, check_count
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug._base.views import NotebookView
-from orthaug.data.record import Channel, Experiment, Prepared, Record
+from orthaug.data.record import Channel, Experiment, Preparation, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.filters import MotionFilter
 from orthaug.models.learners import Scaling
@@ -121,7 +121,7 @@ class MotionModel(RecordModel, NotebookView):
     """Least and largest (2, nz) of the learner's features over the fitted run of the training data.
     """
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
-    prepared: tuple[Prepared, ...] = field(default=(), kw_only=True, repr=False)
+    prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
 
     def __repr__(self) -> str:

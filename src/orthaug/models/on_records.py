@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, show
 from orthaug.data.preparation import steps_again
-from orthaug.data.record import Channel, Experiment, Prepared, Record, same_step
+from orthaug.data.record import Channel, Experiment, Preparation, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
@@ -30,7 +30,7 @@ class RecordModel:
     inputs: tuple[Channel, ...]
     sampling_time: float
     largest_output: Vector
-    prepared: tuple[Prepared, ...]
+    prepared: tuple[Preparation, ...]
 
     @property
     def preparation(self) -> tuple[Any, ...]:

@@ -21,7 +21,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.parallel import Heard, Threads, in_threads, nobody
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
@@ -293,7 +293,7 @@ def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
 
 
 def learner_rows(
-    engine: Engine, form: Lagged, numbers: Numbers, x: Matrix, q: Any, weight: Any
+    engine: Engine, form: LaggedDynamics, numbers: Numbers, x: Matrix, q: Any, weight: Any
 ) -> Any:
     """Return regressors x (N, nx) as rows of the engine.
 

@@ -21,7 +21,7 @@ from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics
 
 
@@ -102,7 +102,7 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
 
 
 def step_lagged(
-    form: Lagged, numbers: Numbers, memory: Memory, state: Any, inputs: Any
+    form: LaggedDynamics, numbers: Numbers, memory: Memory, state: Any, inputs: Any
 ) -> tuple[Any, Any]:
     """Return the next state and the outputs (ny,) of one sample."""
     state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))

@@ -31,7 +31,7 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
-from orthaug.physics.shared import Shared, shared_directions
+from orthaug.physics.shared import SharedDirections, shared_directions
 
 # Size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
 _LARGEST = 1e120
@@ -192,7 +192,7 @@ class Problem:
         return np.max([np.abs(e.outputs).max(axis=0) for e in self.record.experiments], axis=0)
 
     @cached_property
-    def shared(self) -> Shared:
+    def shared(self) -> SharedDirections:
         """The directions of θ that a learner on these features could imitate."""
         return shared_directions(
             self.baseline, self.features, self.layout, self.outputs, self.rows.x

@@ -39,7 +39,7 @@ NEARLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
+class SharedDirections:
     """The shared directions of θ.
 
     `basis` (nθ, s) spans them, in reduced form: each column has an entry of one that is zero in all
@@ -70,7 +70,7 @@ class Shared:
             name: float(share) for name, row, share in shares if not row.any() and share < NEARLY
         }
 
-    def beside(self, rest: UnexplainedPhysics | None) -> Shared:
+    def beside(self, rest: UnexplainedPhysics | None) -> SharedDirections:
         """Return these directions and those that the rows do not separate from the features."""
         if rest is None:
             return self
@@ -84,7 +84,7 @@ class Shared:
         ]
         size = np.sqrt(np.maximum(np.diag(rest.whole), 1e-300))[:, None]
         basis = _reduce(np.column_stack([self.basis, more]) * size, 1 / size[:, 0]) / size
-        return Shared(self.names, basis, tuple(moved), rest)
+        return SharedDirections(self.names, basis, tuple(moved), rest)
 
     @property
     def all(self) -> bool:
@@ -113,7 +113,7 @@ class Shared:
             )
         return tuple(described)
 
-    def without_entries(self, held: Iterable[int]) -> Shared:
+    def without_entries(self, held: Iterable[int]) -> SharedDirections:
         """Return the shared directions that leave some entries of θ unchanged.
 
         In reduced form too.
@@ -136,13 +136,16 @@ def shared_directions(
     layout: Layout,
     outputs: Sequence[str],
     x: Float[np.ndarray, "N nx"],
-) -> Shared:
+) -> SharedDirections:
     """Return the directions of θ that a learner on these features could imitate.
 
     Args:
         x: measured regressors, where the moves begin.
     """
-    names, everything = baseline.names, Shared(baseline.names, np.eye(len(baseline.names)))
+    names, everything = (
+        baseline.names,
+        SharedDirections(baseline.names, np.eye(len(baseline.names))),
+    )
     if features.linear and names:
         with np.errstate(all="ignore"):
             phi = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
@@ -162,7 +165,7 @@ def shared_directions(
     before, after = (part[kept].reshape(-1, len(names)) for part in phi)
     with np.errstate(all="ignore"):
         own = np.asarray(baseline.phi(x, layout, tuple(outputs), np))
-        return Shared(names, agreeing_directions(before, after)).beside(
+        return SharedDirections(names, agreeing_directions(before, after)).beside(
             left_over(own, _values(features, layout)(x))
         )
 
@@ -172,7 +175,7 @@ def spanned_directions(
     slopes: Float[np.ndarray, "k N nt"],
     features: Float[np.ndarray, "N nz"],
     learned: Any = True,
-) -> Shared:
+) -> SharedDirections:
     """Return the directions along which all slopes are linear combinations of features.
 
     Args:
@@ -184,7 +187,7 @@ def spanned_directions(
     size = np.sqrt(np.mean(slopes**2, axis=(1, 2), keepdims=True))
     slopes, left = (part / np.where(size > 0, size, 1.0) for part in (slopes, left))
     flat, changed = (part.reshape(-1, len(names)) for part in (slopes, slopes + left))
-    return Shared(names, agreeing_directions(flat, changed))
+    return SharedDirections(names, agreeing_directions(flat, changed))
 
 
 def seen_columns(

@@ -190,7 +190,7 @@ def _unheard(stage: str, rung: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Confirmed:
+class Confirmation:
     """A chosen term on the rows that had no say in the choice.
 
     `p` is its p-value beside physics and the other terms, and `q` the least rate of false
@@ -260,7 +260,7 @@ class Selection:
         return {} if self.terms is None else self.terms.shares()
 
     @cached_property
-    def confirmed(self) -> dict[str, Confirmed]:
+    def confirmed(self) -> dict[str, Confirmation]:
         """Every chosen term on the rows that had no say in the choice.
 
         Empty where there are no such rows.
@@ -281,7 +281,7 @@ class Selection:
         )
         q = false_discovery_rates(p)
         return {
-            str(term): Confirmed(float(a), float(b))
+            str(term): Confirmation(float(a), float(b))
             for term, a, b in zip(tested.index, p, q, strict=True)
         }
 

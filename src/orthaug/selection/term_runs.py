@@ -34,7 +34,7 @@ from orthaug.fitting.segments import Segments, build_segments
 from orthaug.fitting.solvers.descent import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.lagged import Lagged
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.physics.problem import Problem
 from orthaug.selection.forward import COLLINEAR, Equations
 
@@ -48,7 +48,7 @@ _TOLERANCE = 1e-4  # relative change of the loss: models are compared, not publi
 
 
 @dataclass(frozen=True)
-class Menu(Lagged):
+class Menu(LaggedDynamics):
     """A lagged form with the factors as `features`, for `width` terms of up to `order` factors.
 
     `ŷ_k = φ(x_k)θ + Σ_j w_j t_j(x_k)`, the t_j products of few factors whose numbers come with the
