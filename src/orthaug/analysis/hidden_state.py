@@ -245,6 +245,13 @@ def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
     )
 
 
+def _lags_read(model: Any, run: LinearRun) -> Matrix:
+    """Return the lags along the run that the learner's features read, (T, n)."""
+    form = model.form
+    x = form.regressor(run.states.T, run.rows.T, np)
+    return np.asarray(x)[[form.layout.index(lag) for lag in form.features.lags]].T
+
+
 def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
     """Return the equations that may lack a term: outputs, or states with parameter or learner."""
     if isinstance(model, MotionModel):
@@ -281,20 +288,21 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
 
     They are starts, parameters, and functions of the learner's inputs.
     """
-    features = [_features(model, run) for run in runs]
+    features, terms = [_features(model, run) for run in runs], [np.zeros((0, 0))] * len(runs)
     of_terms = bool(getattr(model.form.features, "linear", False))
-    functions = np.asarray if of_terms else _bends(np.concatenate(features))
+    if of_terms and features[0].shape[1] > _MULTIPLIED:  # of fewer lags, whose bends are theirs
+        features, terms = [_lags_read(model, run) for run in runs], features
+    bends = _bends(np.concatenate(features))
     places = [i for i, _ in _equations(model)]
     if isinstance(model, MotionModel):
         places = list(model.form.motion.learned[0])
     found = []
-    for j, (run, z) in enumerate(zip(runs, features, strict=True)):
+    for j, (run, z, own_terms) in enumerate(zip(runs, features, terms, strict=True)):
         starts = run.starts()
         own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
         own[..., j * starts.shape[2] : (j + 1) * starts.shape[2]] = starts
-        learned = (
-            [_respond(model, run, place, functions(z)) for place in places] if z.shape[1] else []
-        )
+        functions = [bends(z), *([own_terms] if own_terms.size else [])] if z.shape[1] else []
+        learned = [_respond(model, run, place, f) for place in places for f in functions]
         found.append(np.concatenate([run.parameters(), own, *learned], axis=2))
     return found
 
