@@ -910,3 +910,37 @@ def test_designs_that_cannot_be_written(project, out, words):
 def test_design_needs_a_file(project):
     project.write_text(MACHINE + DESIGN)
     assert one_line(run("design", project).err, "--out")
+
+
+@pytest.mark.parametrize("noise", ["uneven", "white"])
+def test_a_split_says_where_the_fit_has_larger_standard_errors(tmp_path, monkeypatch, noise):
+    """It has the statistics of white, even errors; the fit asked the residual."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(size=600), np.zeros(600)
+    for k in range(1, 600):
+        size = 0.3 * abs(u[k - 1]) if noise == "uneven" else 0.2
+        y[k] = 0.7 * y[k - 1] + 0.5 * u[k - 1] + size * rng.normal()
+    pd.DataFrame({"u": u, "y": y}).to_csv("run.csv", index=False)
+    Path("spec.toml").write_text(
+        '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\n'
+        'train = { files = ["run.csv"] }\n[lags]\nna = 1\nnb = 1\n[validation]\nblocks = 0\n'
+        '[baseline]\nterms = [{ parameter = "a", regressor = "y[k-1]" }, '
+        '{ parameter = "b", regressor = "u[k-1]" }]\n[training]\nfocus = "prediction"\n'
+    )
+    assert run("fit", "spec.toml", "--out", "out").code == 0
+    fit = json.loads(Path("out/result.json").read_text())
+    split = finite_json(run("split", "out", "run.csv", "--json").out)
+    found = [w["text"] for w in split["warnings"] if w["code"] == "plain_standard_errors"]
+    if noise == "white":
+        assert "standard_errors_by" not in fit and not found
+        return
+    assert fit["standard_errors_by"] == "hc3"
+    ratio = max(row["std"] / row["plain_std"] for row in fit["parameters"])
+    assert ratio > 1.2 and f"up to {ratio:.2g} times as large" in found[0]
+    # a fit that gave none: the split gives none
+    fit["standard_errors_by"] = "none"
+    Path("out/result.json").write_text(json.dumps(fit))
+    split = finite_json(run("split", "out", "run.csv", "--json").out)
+    assert all(row["std"] is None and row["ci95"] is None for row in split["parameters"])
+    assert "the fit gave none" in split["warnings"][0]["text"]

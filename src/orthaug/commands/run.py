@@ -81,6 +81,8 @@ class ModelOnData:
     rows: int = 0
     notes: tuple[str, ...] = ()
     warnings: tuple[Warning, ...] = ()
+    withheld: bool = False
+    """Whether its fit gave no standard errors, for a reason that other parameters share."""
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:

@@ -25,6 +25,7 @@ from orthaug.commands.run import (
 )
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
+from orthaug.fitting.estimates import STD_KINDS, WITHHELD
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.model import Model
@@ -61,10 +62,36 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
         read.append(
             record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows))
         )
-    record = Record.join(read)
-    return ModelOnData(
-        loaded, record, data[0], 0, (*prepared_notes(loaded, record), *notes), tuple(warnings)
-    )
+    record, (doubts, withheld) = Record.join(read), _standard_errors(model)
+    notes = [*prepared_notes(loaded, record), *notes]
+    found = (*warnings, *doubts)
+    return ModelOnData(loaded, record, data[0], 0, tuple(notes), found, withheld)
+
+
+def _standard_errors(model: Path) -> tuple[list[Warning], bool]:
+    """Return what the model's result says of its standard errors, and whether it withheld them.
+
+    A split has the statistics of white errors of constant variance only.
+    """
+    for content in results_beside(model):
+        with suppress(KeyError, TypeError, AttributeError):
+            kind, rows = content.get("standard_errors_by"), content["parameters"]
+            if kind is None or kind not in STD_KINDS:
+                return [], False
+            if kind in WITHHELD:
+                text = (
+                    "no standard errors: the fit gave none, because "
+                    f"{STD_KINDS[kind].partition(': ')[2]}."
+                )
+                return [Warning("no_statistics", text)], True
+            ratios = [row["std"] / row["plain_std"] for row in rows if row.get("plain_std")]
+            times = f", which are up to {max(ratios):.2g} times as large" if ratios else ""
+            text = (
+                "these standard errors are for white errors of constant variance. Those of the "
+                f"fit are {STD_KINDS[kind]}{times}. Read the intervals here as too narrow."
+            )
+            return [Warning("plain_standard_errors", text)], False
+    return [], False
 
 
 def _other_files(model: Path, data: Sequence[Path]) -> list[Warning]:
@@ -141,7 +168,14 @@ def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
         InputError: a θ at a bound, a measure that does not fit the model, other data than those of
             its training.
     """
-    return _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
+    found = _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
+    if not opened.withheld:
+        return found
+    rows = [
+        row.model_copy(update={"std": None, "ci95": None, "plain_std": None})
+        for row in found.parameters
+    ]
+    return found.model_copy(update={"parameters": rows})
 
 
 def _split_lagged(
