@@ -569,6 +569,7 @@ def test_a_split_takes_the_rows_of_the_training(inside, tmp_path):
     assert [warning["code"] for warning in other["warnings"]] == ["other_training_data"]
 
 
+@pytest.mark.proof
 def test_the_measure_of_the_spec_is_that_of_split(tmp_path, monkeypatch):
     """Under noise of the equation: where errors are coloured, only the intervals of the fit are robust."""
     make_project(tmp_path)

@@ -308,6 +308,7 @@ def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch
     assert ratio.between(0.7, 1.4).all()
 
 
+@pytest.mark.proof
 def test_segments_on_workers_give_the_free_run_of_rows_in_memory(folder, in_memory, cluster):
     from orthaug import Dask
 

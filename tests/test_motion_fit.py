@@ -597,6 +597,7 @@ def tanks(rows: int = 300) -> oa.Record:
     )
 
 
+@pytest.mark.proof
 def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     motion = oa.Motion.from_equations(
         states=[
