@@ -107,11 +107,18 @@ def run(kind: str, count: int) -> tuple[Counter, float]:
 
 
 def guided(target: str, arguments: list[str]) -> None:
-    """Let atheris look for inputs that reach new code; the rest of the arguments is its own."""
+    """Let atheris look for inputs that reach new code; the rest of the arguments is its own.
+
+    A corpus, the first of them, gets valid inputs to begin from.
+    """
     import atheris
 
     with atheris.instrument_imports(include=["orthaug"]):
-        from fuzzing_bytes import TARGETS
+        from fuzzing_bytes import TARGETS, write_seeds
+    corpus = Path(arguments[0]) if arguments and not arguments[0].startswith("-") else None
+    if corpus is not None:
+        corpus.mkdir(parents=True, exist_ok=True)
+        write_seeds(target, corpus)
     atheris.Setup([sys.argv[0], *arguments], TARGETS[target])
     atheris.Fuzz()
 

@@ -19,6 +19,7 @@ from orthaug.data.expressions import parse_named
 from orthaug.data.tables import column_names
 from orthaug.models import storage
 
+ENDINGS = (".csv", ".tsv", ".npz", ".mat", ".h5", ".xlsx", ".parquet")
 _KNOWN = dict.fromkeys(("x", "v", "u", "k"), 1.0)
 
 
@@ -32,9 +33,8 @@ def expression(data: bytes) -> None:
 
 def header(data: bytes) -> None:
     """Read the columns of a file whose ending the first byte chooses."""
-    endings = (".csv", ".tsv", ".npz", ".mat", ".h5", ".xlsx", ".parquet")
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"run{endings[data[0] % len(endings)] if data else '.csv'}")
+        path = Path(folder, f"run{ENDINGS[data[0] % len(ENDINGS)] if data else '.csv'}")
         path.write_bytes(data[1:])
         try:
             column_names(path)
@@ -79,6 +79,25 @@ def _arrays(motion: bool) -> dict[str, Any]:
             fuzzing.motion_files(Path(folder)) if motion else fuzzing.model_files(Path(folder))
         )
     return load_arrays(content["arrays.safetensors"])
+
+
+def write_seeds(target: str, corpus: Path) -> None:
+    """Write valid inputs of a target to begin from: a fuzzer finds no archive and no model from nothing."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, seeds = Path(name), {}
+        if target == "header":
+            for i, ending in enumerate(ENDINGS):
+                kind = {".mat": "v5.mat"}.get(ending, ending[1:])
+                fuzzing.write_original(kind, folder / f"run{ending}")
+                seeds[kind] = bytes([i]) + (folder / f"run{ending}").read_bytes()
+        elif target == "model":
+            for kind, files in (("lagged", fuzzing.model_files), ("motion", fuzzing.motion_files)):
+                (folder / kind).mkdir()
+                seeds[kind] = files(folder / kind)["model.json"]
+        else:
+            seeds["equation"] = b"-(u - k*x**2)/max(abs(v), 1e-3) + tanh(2*v)*sqrt(x**2 + 1) - pi"
+    for kind, content in seeds.items():
+        (corpus / kind).write_bytes(content)
 
 
 TARGETS = {"expression": expression, "header": header, "model": model}
