@@ -403,7 +403,8 @@ def test_an_npz_of_some_megabytes_that_holds_two_arrays_of_3_gigabytes(tmp_path)
         assert member.read(128) == npy("(400000000,)") and not any(member.read(2**22))
     assert 5e6 < path.stat().st_size < 8e6
     began = time.process_time()
-    assert "'u' is 2.98 GiB in" in refusal(path, "u", "y")
+    text = refusal(path, "u", "y")
+    assert "'u' is 2.98 GiB in" in text or "GiB of memory" in text  # of little memory the sum
     with pytest.raises(InputError, match="'u' is 2.98 GiB in"):
         survey(path)
     assert time.process_time() - began < 2
