@@ -20,7 +20,7 @@ import scipy.special
 from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.memory import KINDS, MemoryTerm, filter_signal, memory_terms
+from orthaug.analysis.memory import KINDS, MemoryTerm, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.analysis.whiteness import whitening_filter
@@ -288,23 +288,36 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
 
     They are starts, parameters, and functions of the learner's inputs.
     """
-    features, terms = [_features(model, run) for run in runs], [np.zeros((0, 0))] * len(runs)
-    of_terms = bool(getattr(model.form.features, "linear", False))
-    if of_terms and features[0].shape[1] > _MULTIPLIED:  # of fewer lags, whose bends are theirs
-        features, terms = [_lags_read(model, run) for run in runs], features
-    bends = _bends(np.concatenate(features))
+    learned = _learned_functions(model, runs)
     places = [i for i, _ in _equations(model)]
     if isinstance(model, MotionModel):
         places = list(model.form.motion.learned[0])
     found = []
-    for j, (run, z, own_terms) in enumerate(zip(runs, features, terms, strict=True)):
+    for j, (run, functions) in enumerate(zip(runs, learned, strict=True)):
         starts = run.starts()
         own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
         own[..., j * starts.shape[2] : (j + 1) * starts.shape[2]] = starts
-        functions = [bends(z), *([own_terms] if own_terms.size else [])] if z.shape[1] else []
-        learned = [_respond(model, run, place, f) for place in places for f in functions]
-        found.append(np.concatenate([run.parameters(), own, *learned], axis=2))
+        moved = [_respond(model, run, place, functions) for place in places if functions.size]
+        found.append(np.concatenate([run.parameters(), own, *moved], axis=2))
     return found
+
+
+def _learned_functions(model: Model | MotionModel, runs: list[LinearRun]) -> list[Matrix]:
+    """Return functions (T, k) of what the learner sees along every run, k = 0 without a learner.
+
+    Many terms are functions of few lags: they are taken as they are, beside bends of these lags.
+    """
+    features = [_features(model, run) for run in runs]
+    count = features[0].shape[1]
+    if count > _MULTIPLIED and getattr(model.form.features, "linear", False):
+        lags = [_lags_read(model, run) for run in runs]
+        bends = _bends(np.concatenate(lags))
+        pairs = zip(lags, features, strict=True)
+        return [np.concatenate([bends(x), terms], axis=1) for x, terms in pairs]
+    if not count:
+        return features
+    bends = _bends(np.concatenate(features))
+    return [bends(z) for z in features]
 
 
 def _bends(z: Matrix):
@@ -361,7 +374,7 @@ def _added_columns(
             families += [_Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
                 values = _static(own[name], size) + [
-                    filter_signal(term, own[name], step) / size for term in terms
+                    term.along(own[name], step) / size for term in terms
                 ]
                 found.append(_respond(model, run, place, np.stack(values, axis=1)))
     return families, [np.concatenate(found, axis=2) for found in columns]

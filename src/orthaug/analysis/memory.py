@@ -43,8 +43,31 @@ class MemoryTerm:
         return f"{WORDS[self.kind]} of {self.on}, {symbol} {self.scale:.3g}{unit}"
 
     def along(self, values: Vector, sampling_time: float) -> Vector:
-        """Return the internal state along a signal (N,), as `filter_signal`."""
-        return filter_signal(self, values, sampling_time)
+        """Compute the internal state of a term along a signal (N,), from rest at its first value.
+
+        A lag is exact for a held input. The others are driven by the increments d of the signal:
+        play `z = min(max(z, x − w), x + w)`, LuGre `z⁺ = z + d − |d| z/w`, and Bouc-Wen
+        `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
+        """
+        if self.kind == "lag":
+            pole = float(np.exp(-sampling_time / self.scale))
+            return lfilter([0.0, 1 - pole], [1.0, -pole], values, zi=[values[0]])[0]
+        width, state = self.scale, 0.0
+        if self.kind == "backlash":
+            state, found = float(values[0]), []
+            for x in values.tolist():
+                state = min(max(state, x - width), x + width)
+                found.append(state)
+            return np.array(found)
+        found, steps = [0.0], np.diff(values).tolist()
+        for d in steps:
+            if self.kind == "lugre":
+                state += d - abs(d) * state / width
+            else:
+                state += d - (abs(d) * abs(state) * state + d * state * state) / (2 * width * width)
+            state = min(max(state, -width), width)
+            found.append(state)
+        return np.array(found)
 
 
 def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
@@ -53,31 +76,3 @@ def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTe
     lags = [step for step in TIME_CONSTANTS if step <= _LONGEST * len(values)]
     terms = [MemoryTerm("lag", on, step * sampling_time) for step in lags]
     return terms + [MemoryTerm(kind, on, share * size) for kind in KINDS[1:] for share in WIDTHS]
-
-
-def filter_signal(term: MemoryTerm, values: Vector, sampling_time: float) -> Vector:
-    """Compute the internal state of a term along a signal (N,), from rest at its first value.
-
-    A lag is exact for a held input. The others are driven by the increments d of the signal:
-    play `z = min(max(z, x − w), x + w)`, LuGre `z⁺ = z + d − |d| z/w`, and Bouc-Wen
-    `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
-    """
-    if term.kind == "lag":
-        pole = float(np.exp(-sampling_time / term.scale))
-        return lfilter([0.0, 1 - pole], [1.0, -pole], values, zi=[values[0]])[0]
-    width, state = term.scale, 0.0
-    if term.kind == "backlash":
-        state, found = float(values[0]), []
-        for x in values.tolist():
-            state = min(max(state, x - width), x + width)
-            found.append(state)
-        return np.array(found)
-    found, steps = [0.0], np.diff(values).tolist()
-    for d in steps:
-        if term.kind == "lugre":
-            state += d - abs(d) * state / width
-        else:
-            state += d - (abs(d) * abs(state) * state + d * state * state) / (2 * width * width)
-        state = min(max(state, -width), width)
-        found.append(state)
-    return np.array(found)

@@ -84,11 +84,12 @@ def _standard_errors(model: Path) -> tuple[list[Warning], bool]:
                     f"{STD_KINDS[kind].partition(': ')[2]}."
                 )
                 return [Warning("no_statistics", text)], True
-            ratios = [row["std"] / row["plain_std"] for row in rows if row.get("plain_std")]
-            times = f", which are up to {max(ratios):.2g} times as large" if ratios else ""
+            known = [row for row in rows if row.get("std") and row.get("plain_std")]
+            ratios = [row["std"] / row["plain_std"] for row in known]
+            least = f"{min(ratios):.2g} to {max(ratios):.2g} times as large: " if ratios else ""
             text = (
                 "these standard errors are for white errors of constant variance. Those of the "
-                f"fit are {STD_KINDS[kind]}{times}. Read the intervals here as too narrow."
+                f"fit are {least}{STD_KINDS[kind]}. The intervals here do not count that."
             )
             return [Warning("plain_standard_errors", text)], False
     return [], False

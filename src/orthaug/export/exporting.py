@@ -116,12 +116,12 @@ def export(
     check_export(to, folder, name, force=force)
     target: Target = TARGETS[to]()
     program = program_of(model, name, storage.digest(model))
-    vectors = _vectors_of(model, program)
     if program.scheme is not None and program.scheme.kind not in WRITTEN:
         raise InputError(
             f"the integrator '{program.scheme.kind}' cannot be written as code; known are "
             f"{', '.join(WRITTEN)}. `model.step` and `oa.numpy_step` take any integrator."
         )
+    vectors = _vectors_of(model, program)
     files = dict(target.files(program, vectors))
     files |= {
         VECTORS: vectors.csv(program),
