@@ -85,7 +85,6 @@ CONCEPTS = {
     "selection.explaining": "the regression behind `explain`",
     "selection.explanation": "the verb `explain`",
     "selection.first_orders": "orders for a first spec",
-    "selection.nonlinearity": "a test",
     "selection.rivals": "candidates that a chosen term may replace",
     "selection.selecting": "the verb `select`",
 }

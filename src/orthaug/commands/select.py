@@ -27,8 +27,9 @@ from orthaug.reports.selection import SelectResult
 from orthaug.selection.parts import CONDITIONAL, Parts
 
 if TYPE_CHECKING:
+    from orthaug.selection.choice import Selection
     from orthaug.selection.kept_physics import Shift
-    from orthaug.selection.selecting import OnStage, Selection
+    from orthaug.selection.selecting import OnStage
 
 _DEGREE = 3  # of the terms to search where a spec has no [learner]
 

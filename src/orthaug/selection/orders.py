@@ -14,8 +14,10 @@ import numpy as np
 
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug.data.record import Record
-from orthaug.data.terms import TermLibrary
+from orthaug.data.regressors import Lags
+from orthaug.data.terms import CONSTANT, TermLibrary
 from orthaug.fitting.criteria import Criterion
+from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem
 from orthaug.selection.term_path import Blocks, OnModel, PathModel, Search, judge_all
 from orthaug.selection.term_runs import TermRuns
@@ -59,6 +61,11 @@ class Orders:
                         yield replace(
                             base, nb=fewer, nk=tuple(n + (j == i) for j, n in enumerate(self.nk))
                         )
+
+    @property
+    def lags(self) -> Lags:
+        """The lags that a regressor of these orders has."""
+        return Lags(self.na, self.nb, self.nk)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +114,15 @@ class OrderSearch(Search):
     def chosen(self) -> Orders:
         """Those of the choice."""
         return self.orders[self.place]
+
+    def linear_texts(self, record: Record, baseline: Baseline) -> list[str]:
+        """Return linear lags of the choice, and its constant, that the physics does not have."""
+        outputs, inputs = (
+            [channel.name for channel in group] for group in (record.outputs, record.inputs)
+        )
+        own = {term.regressor for term in baseline.terms}
+        linear = [str(lag) for lag in self.chosen.lags.layout(outputs, inputs)]
+        return [text for text in [*linear, *([CONSTANT] * self.constant)] if text not in own]
 
 
 def search_orders(

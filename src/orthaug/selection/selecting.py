@@ -5,21 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.special
 
 from orthaug._base.checks import check_count, check_number, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug.analysis.robustness import robust_where_asked
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, in_order
-from orthaug.data.terms import CONSTANT
 from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.held_out import held_out_blocks, mean_square, squared_errors
@@ -31,7 +27,8 @@ from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.problem import Problem, pose, regressor_of
 from orthaug.selection.candidates import candidates
-from orthaug.selection.false_discoveries import LEVEL, Control, false_discovery_rates
+from orthaug.selection.choice import LearnerSearch, Selection
+from orthaug.selection.false_discoveries import LEVEL, Control
 from orthaug.selection.forward import COLLINEAR
 from orthaug.selection.kept_physics import PhysicsComparison, kept_physics
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
@@ -40,42 +37,23 @@ from orthaug.selection.parts import (
     AS_DECLARED,
     CONDITIONAL,
     NONE,
-    SPLIT,
     Intervals,
     Parts,
     of_parts,
     split_record,
 )
-from orthaug.selection.rivals import rivals
 from orthaug.selection.term_path import (
     OnModel,
     PathModel,
-    RankedModel,
-    Search,
     TermPath,
     climb,
-    from_both_starts,
 )
 from orthaug.selection.term_runs import Point, TermRuns
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from orthaug.fitting.estimates import Estimate
+    pass
 
 _ITERATIONS = 40  # of a network on a fold
-
-
-@dataclass(frozen=True, eq=False)
-class LearnerSearch(Search):
-    """Networks, physics alone first."""
-
-    learners: tuple[MLP | None, ...]
-
-    @property
-    def chosen(self) -> MLP | None:
-        """Network of the choice; None for physics alone."""
-        return self.learners[self.place]
 
 
 def search_learners(
@@ -189,209 +167,6 @@ def _unheard(stage: str, rung: Any) -> None:
     """Ignore a model; used where nobody listens."""
 
 
-@dataclass(frozen=True)
-class Confirmation:
-    """A chosen term on the rows that had no say in the choice.
-
-    `p` is its p-value beside physics and the other terms, and `q` the least rate of false
-    discoveries at which it is one among the chosen terms (Benjamini and Hochberg 1995).
-    """
-
-    p: float
-    q: float
-
-
-@dataclass(frozen=True, eq=False)
-class Selection:
-    """Result of `select`.
-
-    Print `selection.summary()`; take `selection.table`; go on with `selection.estimate()`.
-    """
-
-    record: Record = field(repr=False)
-    """What `estimate` fits: rows that had no say in the choice, where these suffice."""
-    baseline: Baseline
-    criterion: Criterion
-    delays: tuple[Delay, ...]
-    orders: OrderSearch
-    nonlinearity: Nonlinearity | None
-    terms: TermPath | None
-    learners: LearnerSearch | None
-    notes: tuple[Warning, ...]
-    stopped: bool = False
-    """Whether the search was stopped before its end; what it had found by then was chosen from."""
-    physics: PhysicsComparison | None = None
-    """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or
-    there is no physics.
-    """
-    reach: Orders | None = None
-    """The orders that were chosen, with lags of inputs that act by a nonlinear function alone; None
-    for no such.
-    """
-    intervals: Intervals = Intervals.empty("all rows chose")
-    """Where intervals of a fit of the choice come from."""
-    level: float = LEVEL
-    """The rate of false discoveries that was allowed."""
-
-    @property
-    def lags(self) -> Lags:
-        """Chosen orders, and lags of inputs that have only a nonlinear effect."""
-        chosen = self.reach or self.orders.chosen
-        return Lags(chosen.na, chosen.nb, chosen.nk)
-
-    @cached_property
-    def learner(self) -> Learner | None:
-        """The learner that was chosen, written out; None where nothing helps."""
-        if self.learners is not None:
-            return self.learners.chosen
-        if self.terms is not None:
-            chosen, texts = self.terms.chosen.point.chosen, self.terms.runs.library.texts
-            return Terms(tuple(texts[i] for i in chosen)) if chosen else None
-        linear = _linear_texts(self.orders, self.record, self.baseline)
-        return Terms(tuple(linear)) if linear else None
-
-    @cached_property
-    def shares(self) -> dict[str, float]:
-        """Share of random halves of the rows that chose in which each chosen term is chosen.
-
-        Empty where no terms were chosen from a library; linear lags are chosen as orders, and a
-        network as a whole.
-        """
-        return {} if self.terms is None else self.terms.shares()
-
-    @cached_property
-    def confirmed(self) -> dict[str, Confirmation]:
-        """Every chosen term on the rows that had no say in the choice.
-
-        Empty where there are no such rows.
-
-        Its standard error is the one that the errors ask for, robust against colour and uneven
-        size.
-        """
-        if self.intervals.source != SPLIT or not isinstance(self.learner, Terms):
-            return {}
-        fit = self.estimate(blocks=0)
-        if not fit.status.ok:
-            return {}
-        table = robust_where_asked(fit, fit.model.predict(self.record)).terms
-        tested = table[table["std"] > 0]
-        freedom = max(fit.model.statistics.freedom, 1.0)
-        p = 2 * scipy.special.stdtr(
-            freedom, -np.abs(np.asarray(tested["coefficient"] / tested["std"], dtype=float))
-        )
-        q = false_discovery_rates(p)
-        return {
-            str(term): Confirmation(float(a), float(b))
-            for term, a, b in zip(tested.index, p, q, strict=True)
-        }
-
-    @property
-    def unconfirmed(self) -> tuple[str, ...]:
-        """The chosen terms whose q-value on the rows that had no say is above the level."""
-        return tuple(term for term, one in self.confirmed.items() if one.q > self.level)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Arguments for `estimate`, beside record and baseline."""
-        judged = (
-            {"regularization": "none", "fallback": False} if isinstance(self.learner, Terms) else {}
-        )
-        lags = None if isinstance(self.learner, Terms | None) else self.lags
-        return {"learner": self.learner, "lags": lags, "criterion": self.criterion} | judged
-
-    @cached_property
-    def rivals(self) -> dict[str, tuple[str, ...]]:
-        """Rivals of each chosen term on the rows that `estimate` fits.
-
-        Beside a rival the term is not significant, so these rows do not show which of the two acts.
-        """
-        if self.terms is None or not isinstance(self.learner, Terms):
-            return {}
-        runs = self.terms.runs
-        if self.intervals.source != SPLIT:
-            return rivals(runs, self.terms.chosen.point)
-        own = TermRuns.of(
-            runs.problem.on(self.record), runs.library, runs.criterion, None, runs.collinear
-        )
-        return rivals(own, from_both_starts(own, self.terms.chosen.point.chosen))
-
-    def estimate(self, **options: Any) -> Estimate:
-        """Return the fit of the choice to `record`; `options` of `estimate` beside it.
-
-        It has no standard errors and no intervals where the rows that are fitted chose the terms.
-        """
-        fit = estimate(self.record, self.baseline, **(self.options | options))
-        if self.intervals.source != NONE:
-            return fit
-        return fit.withheld("chosen", Warning("conditional_on_selection", self.intervals.text))
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """A row for each model that was judged, in order.
-
-        `stage` is orders, terms or learner; `size` the number of lags, terms or weights; `score`
-        the RMS error of free runs on held-out blocks in the output's unit, `standard_error` its
-        own; `within` whether it is as good as the best of its stage; `seconds` what it took (of
-        orders and learners the sum over its fits).
-        """
-        import pandas as pd
-
-        rows = []
-        for stage, judged in self._stages():
-            for one in judged:
-                rows.append(
-                    {
-                        "stage": stage,
-                        "model": ", ".join(one.rung.change) or "physics alone",
-                        "size": one.rung.size,
-                        "score": one.rung.score,
-                        "standard_error": one.error,
-                        "within": one.within,
-                        "chosen": one.chosen,
-                        "seconds": one.rung.seconds,
-                    }
-                )
-        return pd.DataFrame(rows)
-
-    def _stages(self) -> list[tuple[str, Sequence[RankedModel]]]:
-        stages: list[tuple[str, Sequence[RankedModel]]] = [("orders", self.orders.judge())]
-        if self.terms is not None:
-            stages.append(("terms", self.terms.judge()))
-        if self.learners is not None:
-            stages.append(("learner", self.learners.judge()))
-        return stages
-
-    def summary(self) -> str:
-        """Return a page of text."""
-        lines = [f"orders      {self.orders.chosen}"]
-        lines += [f"delay       {delay}" for delay in self.delays]
-        if self.nonlinearity is not None:
-            lines.append(f"nonlinear   {self.nonlinearity}")
-        lines.append(
-            f"learner     {self.learner or 'none: nothing helps on the blocks that were held out'}"
-        )
-        lines.append(f"intervals   {self.intervals.source}: {self.intervals.text}")
-        lines += (
-            [f"physics     {shift}" for shift in self.physics.shifts]
-            if self.physics and self.shares
-            else []
-        )
-        if self.shares:
-            width = max(len(term) for term in self.shares)
-            lines += [
-                "",
-                f"{'term':<{width}}  chosen over halves of the data, p and q on the rows that "
-                "were not used for it",
-            ]
-            for term, share in self.shares.items():
-                one = self.confirmed.get(term)
-                tested = "" if one is None else f"  {one.p:8.2g}  {one.q:8.2g}"
-                lines.append(f"{term:<{width}}  {100 * share:3.0f} %{tested}")
-        return "\n".join(
-            [*lines, *(["", *(f"note: {note}" for note in self.notes)] if self.notes else [])]
-        )
-
-
 def select(
     record: Record,
     baseline: Baseline | None = None,
@@ -474,9 +249,9 @@ def select(
     delays = tuple(
         Delay.of(record, i, largest.nk[i] + largest.nb[i], orders.chosen) for i in range(len(names))
     )
-    layout = partial(_layout, problem.outputs, names)
     asked = _with_every_input(orders.chosen, largest)
-    tested = nonlinearity(problem, [str(lag) for lag in layout(asked)]) if layout(asked) else None
+    layout = [str(lag) for lag in asked.lags.layout(problem.outputs, names)]
+    tested = nonlinearity(problem, layout) if layout else None
     reach = _orders_with_inputs(orders.chosen, asked, tested, names)
     search = _Search(problem, criterion, largest, blocks, collinear, level, heard, runner)
     path, found, physics, notes = search.beyond(learner, orders, reach, tested, widths, most)
@@ -528,7 +303,7 @@ class _Search:
 
         Nothing where the search was stopped before.
         """
-        problem, criterion, lags = self.problem, self.criterion, Lags(reach.na, reach.nb, reach.nk)
+        problem, criterion, lags = self.problem, self.criterion, reach.lags
         if isinstance(learner, MLP) and not self.heard.stopped:
             listener = self.heard.of("learner")
             settings = (learner, widths, criterion, self.blocks, listener, self.runner)
@@ -537,9 +312,9 @@ class _Search:
             return None, None, None, []
         baseline, names = problem.baseline, [channel.name for channel in problem.record.inputs]
         runs, notes, considered = _terms(problem, learner, self.largest, criterion, self.collinear)
-        near = [baseline.lags, _layout(problem.outputs, names, reach)]
+        near = [baseline.lags, reach.lags.layout(problem.outputs, names)]
         linear, at_most = (
-            _linear_texts(orders, problem.record, baseline),
+            orders.linear_texts(problem.record, baseline),
             min(most, len(problem.rows) // 10),
         )
         control = Control(self.level, considered) if self.level < 1 else None
@@ -648,20 +423,6 @@ class _Listener:
         return report
 
 
-def _layout(outputs: Sequence[str], inputs: Sequence[str], orders: Orders) -> tuple[Lag, ...]:
-    return Lags(orders.na, orders.nb, orders.nk).layout(outputs, inputs)
-
-
-def _linear_texts(orders: OrderSearch, record: Record, baseline: Baseline) -> list[str]:
-    """Return the linear lags of the choice, and its constant, that the physics does not have."""
-    outputs, inputs = (
-        [channel.name for channel in group] for group in (record.outputs, record.inputs)
-    )
-    own = {term.regressor for term in baseline.terms}
-    linear = [str(lag) for lag in _layout(outputs, inputs, orders.chosen)]
-    return [text for text in [*linear, *([CONSTANT] * orders.constant)] if text not in own]
-
-
 def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
     """Return the chosen orders, and of inputs that they keep no lag of all that are allowed.
 
@@ -699,7 +460,7 @@ def _terms(
 ) -> tuple[TermRuns, list[Warning], int]:
     """Return the runs of the library of terms, notes, and the number of candidates."""
     outputs, inputs = problem.outputs, tuple(channel.name for channel in problem.record.inputs)
-    lags = Lags(largest.na, largest.nb, largest.nk).layout(outputs, inputs)
+    lags = largest.lags.layout(outputs, inputs)
     known = regressor_of(problem.baseline, None, None, outputs, inputs)[0]
     library = learner.library([str(lag) for lag in in_order({*lags, *known}, outputs, inputs)])
     rows = len(problem.rows)
