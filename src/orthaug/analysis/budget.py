@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,7 +19,7 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
-from orthaug.analysis.bias import SuspectedBias, orthogonal_part
+from orthaug.analysis.bias import SuspectedBias, bias_table, seen_table, table_beside
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
@@ -30,10 +29,10 @@ from orthaug.analysis.bias_hull import (
     is_determined,
     undetermined_warning,
 )
-from orthaug.analysis.catalogue import catalogue
+from orthaug.analysis.catalogue import saturations
 from orthaug.analysis.imitation import other_inputs
-from orthaug.analysis.measure_bias import MeasureLinearization, physical_with_bias
-from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
+from orthaug.analysis.measure_bias import LaggedTerms, physical_with_bias
+from orthaug.analysis.suspects import Suspect
 from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
 from orthaug.fitting.estimates import Estimate
@@ -42,25 +41,18 @@ from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.shared import seen_columns, shared_directions
 
-if TYPE_CHECKING:
-    from orthaug.analysis.motion_bias import TermBias
-
 _REMOVED = 0.1  # of the bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
 
 
-def remedies(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> list[str]:
+def remedies(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
     """Return sentences on how to remove the bias of the named parameters, the easiest first."""
-    return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
+    return [*_by_inputs(terms, cause, biased), *_by_measure(terms, cause, biased)]
 
 
-def _by_inputs(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> Iterator[str]:
+def _by_inputs(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
     """Yield the choice of learner inputs that frees most of the parameters."""
-    problem, suspect = linearization.problem, cause.suspect
+    problem, suspect = terms.problem, cause.suspect
     if suspect.memory is not None:  # a function of the past is one of no inputs of one row
         return
     layout, x = problem.layout, problem.rows.x
@@ -81,8 +73,8 @@ def _by_inputs(
         shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
         if shared.all:
             continue
-        left = _bias(replace(linearization, directions=shared.basis), suspect)
-        freed = _freed_parameters(linearization, cause, left, biased)
+        left = _bias(replace(terms, directions=shared.basis), suspect)
+        freed = _freed_parameters(terms, cause, left, biased)
         if len(freed) > len(best[1]):
             best = (inputs, freed)
     if best[1]:
@@ -91,44 +83,36 @@ def _by_inputs(
         yield f"set learner.inputs = [{listed}]{rest}"
 
 
-def _by_measure(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> Iterator[str]:
+def _by_measure(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
     """Yield a measure that brings the bias of all of them near zero."""
-    if cause.seen is False or len(linearization.problem.rows) > _MEASURED_ROWS:
+    if cause.seen is False or len(terms.problem.rows) > _MEASURED_ROWS:
         return
     for measure in (Symmetrized(), Uniform()):
-        if measure.name == linearization.weighed.measure.name:
+        if measure.name == terms.weighed.measure.name:
             continue
         try:
-            other = replace(
-                linearization, weighed=weigh_problem(measure, linearization.problem), learned=None
-            )
+            other = replace(terms, weighed=weigh_problem(measure, terms.problem), learned=None)
             left = _bias(other, cause.suspect)
         except InputError:
             continue
-        if len(_freed_parameters(linearization, cause, left, biased)) == len(biased):
+        if len(_freed_parameters(terms, cause, left, biased)) == len(biased):
             yield f"split under the {measure.name} measure"
             return
 
 
-def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
+def _bias(terms: LaggedTerms, suspect: Suspect) -> Vector:
     """Return the bias per unit of a suspect that the learner sees."""
-    values = suspect.values(
-        linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs
-    )
-    return linearization.weighed.projection.solve_along(
-        times(linearization.weighed.unit, values), linearization.directions
-    )
+    values = suspect.values(terms.weighed.points.x, terms.problem.layout, terms.problem.outputs)
+    return terms.weighed.projection.solve_along(times(terms.weighed.unit, values), terms.directions)
 
 
 def _freed_parameters(
-    linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
+    terms: LaggedTerms, cause: SuspectedBias, left: Vector, biased: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
-    names, before = linearization.problem.baseline.names, np.array(cause.bias)
+    names, before = terms.problem.baseline.names, np.array(cause.bias)
     rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
-        linearization.slopes[0] if linearization.slopes else {}
+        terms.physical[0] if terms.physical else {}
     )
     return tuple(
         name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before)
@@ -196,12 +180,12 @@ class Budget:
 
 def linearization_of(
     fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
-) -> MeasureLinearization:
-    """Return the linearization of a fit for biases, under the measure that θ was split under."""
+) -> LaggedTerms:
+    """Return the terms of a fit for biases, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
     learns = fit.model.form.bound is not None
     learned = fit.model.learner_at(weighed.points.x) if learns else None
-    return MeasureLinearization(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
+    return LaggedTerms(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
 def lagged_budget(
@@ -223,22 +207,20 @@ def lagged_budget(
     return budget_on(linearization_of(fit, measure, physics), fit, suspects)
 
 
-def budget_on(
-    linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
-) -> Budget | None:
-    """Return the budget of a fit on a given linearization."""
+def budget_on(terms: LaggedTerms, fit: Estimate, suspects: Sequence[Suspect]) -> Budget | None:
+    """Return the budget of a fit on a given terms."""
     if (
-        not linearization.problem.baseline.names
-        or linearization.learned is None
-        or not np.all(np.isfinite(linearization.learned))
+        not terms.problem.baseline.names
+        or terms.learned is None
+        or not np.all(np.isfinite(terms.learned))
     ):
         return None
     if fit.freedom < _FEWEST_LEFT:
         return None
     noise = fit.model.statistics.noise
     least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
-    something = np.mean(linearization.learned**2, axis=0) >= least
-    found, nameless = _causes(linearization, suspects, something) if something.any() else ([], [])
+    something = np.mean(terms.learned**2, axis=0) >= least
+    found, nameless = _causes(terms, suspects, something) if something.any() else ([], [])
     if not found:
         return None
     causes, moved = (
@@ -255,15 +237,15 @@ def budget_on(
     shifts = [_theta_shift(cause) for cause in nameless]
     other = np.linalg.norm(np.array(shifts), axis=0) if shifts else 0.0
     ends = hull(fit.theta, std, fit.freedom, candidates, other)
-    names = linearization.problem.baseline.names
+    names = terms.problem.baseline.names
     parameters = parameter_biases(
         names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom
     )
     rows, warnings = (), []
-    if linearization.physics is not None:
-        rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
+    if terms.map is not None:
+        rows, warnings = _physical_rows(terms, fit, candidates, moved, causes, other)
     raised = (
-        _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
+        _warning(own, cause, (*rows, *parameters), suspects, own is not terms)
         for own, cause in found
     )
     raised = [warning for warning in raised if warning is not None]
@@ -274,7 +256,7 @@ def budget_on(
     return Budget(causes, parameters, rows, (*raised, *warnings))
 
 
-def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
+def noise_share(terms: LaggedTerms, fit: Estimate) -> float:
     """Return ν, the share of noise in what the learner holds beside the physics.
 
     Noise takes σ² for each weight that the learner uses.
@@ -282,24 +264,17 @@ def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
     noise = fit.model.statistics.noise
     if noise is None:
         return 0.0
-    unit = linearization.weighed.unit
-    own = orthogonal_part(
-        linearization.weighed.projection,
-        times(unit, np.asarray(linearization.learned)),
-        linearization.directions,
-    )
+    unit = terms.weighed.unit
+    own = np.asarray(terms.linearization.unshared_learner)
     rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
     taken = (
-        fit.effective_weights
-        / linearization.problem.count
-        * np.sum(times(unit, rows) ** 2)
-        / own.shape[1]
+        fit.effective_weights / terms.problem.count * np.sum(times(unit, rows) ** 2) / own.shape[1]
     )
     return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 
 
 def _candidates(
-    found: Sequence[tuple[MeasureLinearization, SuspectedBias]],
+    found: Sequence[tuple[LaggedTerms, SuspectedBias]],
     bias: Vector,
     rest: Vector,
     suspects: Sequence[Suspect],
@@ -312,9 +287,7 @@ def _candidates(
     ]
     for own, cause in found:
         others = (*_declared_causes(own, suspects), *_usual(own), *_families(own))
-        others += own.table(
-            saturations([entry.suspect for entry in others]), certify=False, every=False
-        )
+        others += _table(own, saturations([entry.suspect for entry in others]))
         likely = [
             Candidate(
                 entry.suspect.name,
@@ -331,7 +304,7 @@ def _candidates(
 
 
 def _physical_rows(
-    linearization: MeasureLinearization,
+    terms: LaggedTerms,
     fit: Estimate,
     candidates: Sequence[Candidate],
     moved: Float[np.ndarray, "k n"],
@@ -342,10 +315,10 @@ def _physical_rows(
 
     Those are the causes that move any of them farthest.
     """
-    assert linearization.physics is not None
+    assert terms.map is not None
     physical, slopes, bias = (
-        fit.physical(linearization.physics),
-        linearization.slopes,
+        fit.physical(terms.map),
+        terms.physical,
         moved.sum(axis=0),
     )
     own = np.array([np.nan if s is None else s for s in physical.std])
@@ -365,9 +338,7 @@ def _physical_rows(
     for i, c in enumerate({id(c): c for c in chosen}.values()):
         spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        moves, limits = physical_with_bias(
-            linearization, c.moved, fit.covariance, spread, fit.freedom
-        )
+        moves, limits = physical_with_bias(terms, c.moved, fit.covariance, spread, fit.freedom)
         shifts = shifts if i else moves
         ends.append(limits)
     # NaN where one has none
@@ -378,11 +349,11 @@ def _physical_rows(
 
 
 def _causes(
-    linearization: MeasureLinearization,
+    terms: LaggedTerms,
     suspects: Sequence[Suspect],
     something: Bool[np.ndarray, "ny"],
-) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
-    """Return the causes that explain the learner, each with its linearization.
+) -> tuple[list[tuple[LaggedTerms, SuspectedBias]], list[SuspectedBias]]:
+    """Return the causes that explain the learner, each with its terms.
 
     One cause explains all of it, or one cause each output's part.
 
@@ -392,24 +363,20 @@ def _causes(
     Returns:
         The causes; and of each output without one what explains most, where that is less than half.
     """
-    whole, outputs = named_cause(linearization, suspects), linearization.problem.outputs
-    found = [] if whole is None else [(linearization, whole)]
+    whole, outputs = named_cause(terms, suspects), terms.problem.outputs
+    found = [] if whole is None else [(terms, whole)]
     if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
         return found, []
     each, nameless = [], []
     for i in np.flatnonzero(something):
-        own = replace(
-            linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i]
-        )
+        own = replace(terms, learned=np.asarray(terms.learned) * np.eye(len(outputs))[i])
         cause = named_cause(own, suspects) or _most_likely_suspect(own, suspects)
         if cause is not None and explains(cause) < LEAST_SHARE:
             nameless.append(cause)
         elif cause is not None and cause.suspect.column_of(outputs) == i:
             each.append((own, cause))
     each.sort(
-        key=lambda part: (
-            -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned)))
-        )
+        key=lambda part: -np.linalg.norm(times(terms.weighed.unit, np.asarray(part[0].learned)))
     )
     return each if len(each) > len(found) else found, nameless
 
@@ -422,7 +389,7 @@ def _owners(
 
 
 def named_cause(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
+    terms: LaggedTerms, suspects: Sequence[Suspect], least: float = LEAST_SHARE
 ) -> SuspectedBias | None:
     """Return the cause that explains most of the learner, the declared ones first.
 
@@ -431,8 +398,8 @@ def named_cause(
     Undeclared terms count only if the learner sees them: others are no likely cause.
     """
     for table, families in (
-        (_declared_causes(linearization, suspects), ()),
-        (_usual(linearization), _families(linearization)),
+        (_declared_causes(terms, suspects), ()),
+        (_usual(terms), _families(terms)),
     ):
         best, other = (
             max(table, key=explains, default=None),
@@ -445,46 +412,37 @@ def named_cause(
     return None
 
 
-def _most_likely_suspect(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect]
-) -> SuspectedBias | None:
+def _most_likely_suspect(terms: LaggedTerms, suspects: Sequence[Suspect]) -> SuspectedBias | None:
     """Return the suspect that explains most of the learner, however little, declared or not."""
-    found = (*_declared_causes(linearization, suspects), *_usual(linearization))
+    found = (*_declared_causes(terms, suspects), *_usual(terms))
     return max((entry for entry in found if entry.explained), key=explains, default=None)
 
 
-def explains(entry: SuspectedBias | TermBias) -> float:
+def explains(entry: SuspectedBias) -> float:
     """Return the share of the learner that an entry explains."""
     return entry.explained or 0.0
 
 
-def _declared_causes(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect]
-) -> tuple[SuspectedBias, ...]:
-    return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
+def _table(terms: LaggedTerms, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+    return tuple(bias_table(terms, tuple(suspects), certify=False, every=False))
 
 
-def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    terms = (*usual_suspects(linearization.problem), *usual_terms(linearization.problem))
-    return tuple(
-        entry
-        for entry in linearization.table(terms, certify=False, every=False)
-        if entry.seen is not False
-    )
+def _declared_causes(terms: LaggedTerms, suspects: Sequence[Suspect]) -> tuple[SuspectedBias, ...]:
+    return _table(terms, suspects)
 
 
-def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
+def _usual(terms: LaggedTerms) -> tuple[SuspectedBias, ...]:
+    return tuple(seen_table(terms, (*terms.catalogue.usual(), *terms.catalogue.two_lags())))
+
+
+def _families(terms: LaggedTerms) -> tuple[SuspectedBias, ...]:
     """Return the biases by every member of the catalogue that the learner sees."""
-    table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
-    return tuple(
-        entry
-        for entry in table
-        if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS
-    )
+    table = seen_table(terms, terms.catalogue.families())
+    return tuple(entry for entry in table if (entry.cosine or 0.0) <= MOST_PHYSICS)
 
 
 def rival_of(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+    terms: LaggedTerms, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> SuspectedBias | None:
     """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere.
 
@@ -496,12 +454,10 @@ def rival_of(
     assert cause.explained
     if cause.suspect in suspects:
         return None
-    usual = _usual(linearization)
-    usual += linearization.table(
-        saturations([entry.suspect for entry in usual]), certify=False, every=False
-    )
+    usual = _usual(terms)
+    usual += _table(terms, saturations([entry.suspect for entry in usual]))
     equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
-    to_coordinates, own = linearization.weighed.projection.to_coordinates, _theta_shift(cause)
+    to_coordinates, own = terms.weighed.projection.to_coordinates, _theta_shift(cause)
 
     def separation(entry: SuspectedBias) -> float:
         return float(np.linalg.norm(to_coordinates @ (_theta_shift(entry) - own)))
@@ -515,16 +471,14 @@ def rival_of(
 
 
 def near_causes(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+    terms: LaggedTerms, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> list[SuspectedBias]:
     """Return the next best causes, one per variable, for a cause undeclared and unsure."""
     assert cause.explained
     if cause.suspect in suspects or cause.explained >= SURE_SHARE:
         return []
     others = [
-        entry
-        for entry in _usual(linearization)
-        if entry.suspect != cause.suspect and entry.explained
+        entry for entry in _usual(terms) if entry.suspect != cause.suspect and entry.explained
     ]
     near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
     best: dict[str, SuspectedBias] = {}
@@ -534,7 +488,7 @@ def near_causes(
 
 
 def left_over(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
+    terms: LaggedTerms, cause: SuspectedBias, suspects: Sequence[Suspect]
 ) -> Float[np.ndarray, "k nt"]:
     """Return the standard deviations of the bias of θ that the cause leaves open.
 
@@ -544,9 +498,9 @@ def left_over(
     unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
     """
     assert cause.explained
-    after = _most_likely_suspect(
-        linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect]
-    )
+    others = [suspect for suspect in suspects if suspect != cause.suspect]
+    beside = table_beside(terms, [cause], (*_declared_causes(terms, others), *_usual(terms)))
+    after = max((entry for entry in beside if entry.explained), key=explains, default=None)
     rows = [_theta_shift(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
     return np.array([*rows, *([] if after is None else [_theta_shift(after)])])
 
@@ -609,7 +563,7 @@ def _unbounded_warnings(names: Sequence[str], std: Vector, ends: Matrix) -> list
 
 
 def _warning(
-    linearization: MeasureLinearization,
+    terms: LaggedTerms,
     cause: SuspectedBias,
     rows: Sequence[ParameterBias],
     suspects: Sequence[Suspect],
@@ -629,8 +583,8 @@ def _warning(
         f" in {cause.suspect.output}" if of_one else "",
     )
     rival, cure = (
-        rival_of(linearization, cause, suspects),
-        " or ".join(remedies(linearization, cause, [row.name for row in large])),
+        rival_of(terms, cause, suspects),
+        " or ".join(remedies(terms, cause, [row.name for row in large])),
     )
     other = (
         ""
@@ -638,7 +592,7 @@ def _warning(
         else f" ({rival.suspect.name} explains as much and would imply other values)"
     )
     if share < SURE_SHARE:
-        near = near_causes(linearization, cause, suspects)
+        near = near_causes(terms, cause, suspects)
         close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
         beside = f"; next: {close}" if near else ""
         return Warning(

@@ -8,10 +8,9 @@ from typing import Any, cast
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError
 from orthaug.analysis.budget import Budget, lagged_budget
-from orthaug.analysis.motion_bias import suspected_bias
+from orthaug.analysis.free_run_bias import suspected_bias
 from orthaug.analysis.motion_budget import MotionBudget, declared_budget
-from orthaug.analysis.motion_suspects import MotionSuspect
-from orthaug.analysis.suspects import Suspect
+from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.inference.measures import Measure

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.absorbed import TermAfterFit, term_effects
-from orthaug.analysis.bias import SuspectedBias, bias_table
-from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
+from orthaug.analysis.absorbed import term_effects
+from orthaug.analysis.bias import TermResponse, bias_table
+from orthaug.analysis.catalogue import Catalogue
+from orthaug.analysis.suspects import Suspect
 from orthaug.inference.covariance import reach
+from orthaug.inference.linearization import Linearization
 from orthaug.inference.measures import WeighedPhysics
 from orthaug.inference.physical import PhysicalEstimate, solve
+from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
@@ -27,13 +30,13 @@ _ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little o
 
 
 @dataclass(frozen=True, eq=False)
-class MeasureLinearization:
-    """Linearization that biases under a measure are computed on.
+class LaggedTerms:
+    """Terms that physics on lagged signals may lack, under a measure (`TermPhysics`).
 
     Args:
         weighed: the measure's points and the physics there, of one parameter or more.
-        physics: the map from physical parameters to θ.
         theta: θ̂ for relative biases and for dp/dθ.
+        map: from physical parameters to θ.
         learned: f at the measure's points (M, ny) after a fit, to find how much of it a suspect
             explains.
         directions: (nθ, s) along which θ is split; None for all.
@@ -42,151 +45,126 @@ class MeasureLinearization:
     weighed: WeighedPhysics
     problem: Problem
     theta: Vector
-    physics: PhysicsMap | None = None
+    map: PhysicsMap | None = None
     learned: Matrix | None = None
     directions: Matrix | None = None
 
-    @cached_property
-    def slopes(self) -> tuple[dict[str, Vector], Vector] | None:
-        """dp/dθ by name, and p."""
-        return physical_slopes(self.physics, self.problem, self.theta)
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.problem.baseline.names
 
-    def table(
-        self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True
-    ) -> tuple[SuspectedBias, ...]:
-        """Return the bias by every suspect.
+    @property
+    def value(self) -> Vector:
+        return self.theta
 
-        Args:
-            every: also what is zero on all points.
-        """
-        problem, x = self.problem, self.weighed.points.x
-        suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects]
-        with np.errstate(all="ignore"):
-            deltas = suspect_columns(suspects, x, problem.layout, problem.outputs, self.lengths)
-        kept = [i for i in range(len(suspects)) if every or np.any(deltas[i])]
-        chosen = [suspects[i] for i in kept]
-        return bias_table(
-            self.weighed.projection,
-            problem.baseline.names,
-            chosen,
-            deltas[kept],
-            gain=self.weighed.unit,
-            theta=self.theta,
-            physical=None if self.slopes is None else self.slopes[0],
-            learned=self.learned,
-            certify=certify,
-            directions=self.directions,
-            absorbed=None if self.directions is None else self._absorbed_effects(chosen),
-        )
+    @property
+    def slopes(self) -> Vector:
+        return np.ones(len(self.theta))
+
+    @property
+    def physical(self) -> tuple[dict[str, Vector], Vector] | None:
+        return self._physical
 
     @cached_property
-    def lengths(self) -> tuple[int, ...] | None:
-        """Rows of each experiment, where the points are the training rows; else None."""
-        problem = self.problem
-        return problem.lengths if self.weighed.points.x is problem.rows.x else None
+    def _physical(self) -> tuple[dict[str, Vector], Vector] | None:
+        return physical_slopes(self.map, self.problem, self.theta)
+
+    @cached_property
+    def catalogue(self) -> Catalogue:
+        """The terms that no one named."""
+        return Catalogue.of_problem(self.problem)
+
+    @property
+    def certifies(self) -> bool:
+        return len(self.weighed.points.x) <= CERTIFIED_ROWS
+
+    @property
+    def linearization(self) -> Linearization:
+        return self._linearization
+
+    @cached_property
+    def _linearization(self) -> Linearization:
+        projection = self.weighed.projection
+        count = projection.q.shape[0] * projection.q.shape[1]
+        require_rank(excitation(projection.r, self.names), count)
+        learner = None if self.learned is None else self._weigh(self.learned)
+        return Linearization(projection, self.directions, learner)
+
+    def equation(self, suspect: Suspect) -> None:
+        return None
 
     def values(self, suspect: Suspect) -> Matrix:
-        """Return δ (M, ny) of a suspect at the measure's points."""
-        problem = self.problem
-        own = (self.weighed.points.x, problem.layout, problem.outputs, self.lengths)
-        return suspect.sampled(problem.record.sampling_time).values(*own)
+        problem, x = self.problem, self.weighed.points.x
+        lengths = problem.lengths if x is problem.rows.x else None  # else they are no record
+        found = self._sampled(suspect).values(x, problem.layout, problem.outputs, lengths)
+        return self._weigh(found)
 
-    def without(self, entry: SuspectedBias) -> MeasureLinearization:
-        """Return the linearization less the part of the learner that a suspect explains."""
-        held = (
-            self.values(entry.suspect)
-            if self.directions is None
-            else self._absorbed_effects([entry.suspect])[0].held
-        )
-        return replace(
-            self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
-        )
-
-    def _absorbed_effects(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
-        problem = self.problem
-        layout, outputs = problem.layout, problem.outputs
-
+    def sees(self, suspects: Sequence[Suspect]) -> list[bool | None]:
+        """Return None where the learner could imitate every change of θ: then all is the split."""
+        if self.directions is None:
+            return [None] * len(suspects)
+        problem, layout = self.problem, self.problem.layout
         static = [suspect for suspect in suspects if suspect.memory is None]
 
         def forms(x: Matrix) -> Matrix:
-            return np.stack([suspect.form(x, layout) for suspect in static], axis=-1)
+            return np.stack([self._sampled(one).form(x, layout) for one in static], axis=-1)
 
-        def term(suspect: Suspect) -> Callable[[Matrix], Matrix]:
-            if suspect.memory is None:
-                return lambda x: suspect.values(x, layout, outputs)
-            along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
-            return lambda x: along[:: -(-len(along) // len(x))]  # on all rows, or every so many
+        seen = iter(seen_columns(problem.features, layout, problem.rows.x, forms) if static else ())
+        # A function of the past is none of one row
+        return [suspect.memory is None and bool(next(seen)) for suspect in suspects]
 
-        of_static = iter(
-            seen_columns(problem.features, layout, problem.rows.x, forms) if static else ()
+    def respond(self, suspects: Sequence[Suspect], *, run: bool) -> list[TermResponse]:
+        if self.directions is None:
+            held = [self.values(suspect) for suspect in suspects]
+            return [TermResponse(np.zeros(len(self.theta)), one, None, one) for one in held]
+        visible = [bool(seen) for seen in self.sees(suspects)]
+        terms = map(self._term, suspects)
+        effects = term_effects(self.problem, terms, visible, self.weighed.points.x)
+        weighed = ((effect, self._weigh(effect.held)) for effect in effects)
+        return [TermResponse(effect.moved, held, effect.seen, held) for effect, held in weighed]
+
+    def expected_shifts(self, bias: Vector) -> dict[str, dict[str, float | None]] | None:
+        """Return p of θ̂ less p without the bias."""
+        if self.map is None:
+            return None
+        biased, true = (
+            physical_of(self.map, self.problem, t) for t in (self.theta, self.theta - bias)
         )
-        visible = [suspect.memory is None and bool(next(of_static)) for suspect in suspects]
-        return term_effects(problem, map(term, suspects), visible, self.weighed.points.x)
+        return {
+            name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
+            for name, b, t in zip(self.map.names, biased, true, strict=True)
+        }
+
+    def _weigh(self, rows: Matrix) -> Matrix:
+        return times(self.weighed.unit, np.asarray(rows))
+
+    def _sampled(self, suspect: Suspect) -> Suspect:
+        return suspect.sampled(self.problem.record.sampling_time)
+
+    def _term(self, suspect: Suspect) -> Callable[[Matrix], Matrix]:
+        """Return the values (N, ny) of a term on rows of the regressor, or on every so many."""
+        problem, suspect = self.problem, self._sampled(suspect)
+        layout, outputs = problem.layout, problem.outputs
+        if suspect.memory is None:
+            return lambda x: suspect.values(x, layout, outputs)
+        along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
+        return lambda x: along[:: -(-len(along) // len(x))]
 
 
 def bias_under(
-    linearization: MeasureLinearization,
-    suspects: Sequence[Suspect] = (),
-    *,
-    certify_usual: bool = True,
+    terms: LaggedTerms, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True
 ) -> list[dict[str, Any]]:
     """Return the bias by every suspect under a measure, as plain data for JSON.
-
-    It is that of θ and, to first order, of the physical parameters.
 
     Args:
         suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named,
             too.
     """
-    named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
-    table = linearization.table(
-        suspects or usual_suspects(problem),
-        certify=named or (certify_usual and len(points.x) <= CERTIFIED_ROWS),
-        every=named,
-    )
-    found = []
-    for entry in table:
-        delta = linearization.values(entry.suspect)
-        own = {
-            "relative_physical_bias": _relative(entry, linearization.slopes),
-            "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
-            "expected_physical_bias": _expected_shifts(
-                entry, linearization.physics, problem, linearization.theta
-            ),
-        }
-        found.append(entry.as_dict() | own)
-    return found
-
-
-def _expected_shifts(
-    entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
-) -> dict[str, dict[str, float | None]] | None:
-    """Return the shift of each physical parameter by the guessed coefficient.
-
-    It is p of θ̂ less p without the bias.
-    """
-    if physics is None or entry.expected is None:
-        return None
-    biased, true = (
-        physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected))
-    )
-    return {
-        name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
-        for name, b, t in zip(physics.names, biased, true, strict=True)
-    }
-
-
-def _relative(
-    entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None
-) -> dict[str, float | None] | None:
-    """Return the bias of each physical parameter over its value."""
-    if slopes is None or entry.physical is None:
-        return None
-    return {
-        name: bias / p if p else None
-        for (name, bias), p in zip(entry.physical, slopes[1], strict=True)
-    }
+    named = bool(suspects)
+    certify = named or (certify_usual and terms.certifies)
+    table = bias_table(terms, suspects or terms.catalogue.usual(), certify=certify, every=named)
+    return [entry.as_dict() for entry in table]
 
 
 def physical_slopes(
@@ -221,7 +199,7 @@ def _solve_physical(
 
 
 def physical_with_bias(
-    linearization: MeasureLinearization,
+    terms: LaggedTerms,
     bias: Vector,
     covariance: Matrix | None,
     spread: Matrix,
@@ -239,12 +217,11 @@ def physical_with_bias(
         covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the
             bias.
     """
-    physics, problem = linearization.physics, linearization.problem
+    physics, problem = terms.map, terms.problem
     assert physics is not None
-    centre, order = linearization.theta - bias, _order(physics, problem)
+    centre, order = terms.theta - bias, _order(physics, problem)
     now, free = (
-        _solve_physical(physics, problem, theta, covariance)
-        for theta in (linearization.theta, centre)
+        _solve_physical(physics, problem, theta, covariance) for theta in (terms.theta, centre)
     )
     ends = np.full((len(free.value), 2), np.nan)
     if not _is_met(free):

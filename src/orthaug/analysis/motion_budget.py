@@ -7,14 +7,16 @@ residual by one Gauss-Newton step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
+from orthaug.analysis.bias import SuspectedBias, seen_table, table_beside
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
@@ -32,17 +34,15 @@ from orthaug.analysis.budget import (
     list_biases,
     parameter_biases,
 )
-from orthaug.analysis.catalogue import motion_catalogue
-from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.motion_bias import (
+from orthaug.analysis.free_run_bias import (
     CERTIFIED_POINTS,
-    MotionLinearization,
-    TermBias,
+    MotionTerms,
     linearize_fit,
     softened_bias,
     usual_biases,
 )
-from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.analysis.learned_part import learned_reach
+from orthaug.analysis.suspects import MotionSuspect
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.inference.covariance import reach
 
@@ -60,14 +60,14 @@ _UNMOVED = 0.1  # standard errors of every parameter
 class MotionBudget:
     """Bias of every parameter by the terms that explain the learner or the free run's errors."""
 
-    causes: tuple[TermBias, ...]
+    causes: tuple[SuspectedBias, ...]
     """One, or one of each learned equation that explain `share` together."""
     share: float
     parameters: tuple[ParameterBias, ...]
     warnings: tuple[Warning, ...]
 
     @property
-    def cause(self) -> TermBias:
+    def cause(self) -> SuspectedBias:
         """The first of them."""
         return self.causes[0]
 
@@ -82,7 +82,7 @@ class MotionBudget:
 
 
 def declared_budget(
-    fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[TermBias]
+    fit: MotionEstimate, declared: Sequence[MotionSuspect], table: Sequence[SuspectedBias]
 ) -> MotionBudget | None:
     """Return the budget by the declared suspects.
 
@@ -105,30 +105,24 @@ def declared_budget(
     )
 
 
-def families_of(linearization: MotionLinearization) -> list[TermBias]:
+def families_of(linearization: MotionTerms) -> list[SuspectedBias]:
     """Return the biases by every member of the catalogue that the learner sees.
 
     Nothing where it could imitate no parameter.
     """
     if linearization.learned is None or not linearization.shared.basis.shape[1]:
         return []
-    motion, field = linearization.motion, linearization.field
-    on = [entry.text for entry in linearization.place.segmented.problem.features]
-    terms = motion_catalogue(
-        motion, motion.coordinates.physical(linearization.q), field.x, field.u, on
-    )
-    entries = [linearization.entry_without_run(term) for term in terms if linearization.sees(term)]
-    return [
-        entry for entry in entries if linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
-    ]
+    terms = linearization.catalogue.families()
+    table = seen_table(linearization, terms)
+    return [entry for entry in table if (entry.physics_cosine or 0.0) <= MOST_PHYSICS]
 
 
-def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> float:
+def noise_share(fit: MotionEstimate, linearization: MotionTerms) -> float:
     """Return ν, the share of noise in what the learner holds, by the band of the learned curve."""
     half = learned_reach(fit, linearization.field.x, linearization.field.u)
     if half is None or not np.isfinite(half).all():
         return 0.0
-    own = np.sum(linearization.unshared_learner() ** 2)
+    own = np.sum(np.asarray(linearization.linearization.unshared_learner) ** 2)
     return float(
         np.sum(linearization.weigh(half / reach(fit.freedom)) ** 2) / max(own, np.finfo(float).tiny)
     )
@@ -136,9 +130,9 @@ def noise_share(fit: MotionEstimate, linearization: MotionLinearization) -> floa
 
 def motion_budget(
     fit: MotionEstimate,
-    table: Sequence[TermBias],
-    smooth: Sequence[TermBias] = (),
-    families: Sequence[TermBias] = (),
+    table: Sequence[SuspectedBias],
+    smooth: Sequence[SuspectedBias] = (),
+    families: Sequence[SuspectedBias] = (),
     declared: Sequence[MotionSuspect] | None = None,
 ) -> MotionBudget | None:
     """Return the budget by the suspect that explains most, or by one in each learned equation.
@@ -186,7 +180,7 @@ def motion_budget(
 
 
 def _rival_candidates(
-    fit: MotionEstimate, table: Sequence[TermBias], declared: set[MotionSuspect]
+    fit: MotionEstimate, table: Sequence[SuspectedBias], declared: Container[Any]
 ) -> list[Candidate]:
     """Return the rivals of the named cause."""
     linearization = linearize_fit(fit)
@@ -198,9 +192,7 @@ def _rival_candidates(
         for entry in table
         if entry.seen
         and entry.explained
-        and (
-            entry.suspect in declared or linearization.physics_cosine(entry.suspect) <= MOST_PHYSICS
-        )
+        and (entry.suspect in declared or (entry.physics_cosine or 0.0) <= MOST_PHYSICS)
     ]
     return compatible(likely, noise_share(fit, linearization))
 
@@ -212,11 +204,11 @@ class _Causes:
     The last are standard deviations (k, np).
     """
 
-    causes: tuple[TermBias, ...]
+    causes: tuple[SuspectedBias, ...]
     share: float
     moved: Vector
     unsure: Matrix
-    rivals: tuple[TermBias, ...] = ()
+    rivals: tuple[SuspectedBias, ...] = ()
 
 
 def _is_clearly_less(share: float, other: float) -> bool:
@@ -224,29 +216,29 @@ def _is_clearly_less(share: float, other: float) -> bool:
     return share < AS_MUCH * other and 1 - share > max(_AS_CLOSE * (1 - other), _CLOSE)
 
 
-def _size(cause: TermBias) -> float:
+def _size(cause: SuspectedBias) -> float:
     """Return the coefficient by the learner, else by what the free run leaves."""
     if cause.explained is None and cause.residual is not None:
         return cause.residual.coefficient
     return cause.coefficient_found or 0.0
 
 
-def rivals_of(cause: TermBias, table: Sequence[TermBias]) -> list[TermBias]:
+def rivals_of(cause: SuspectedBias, table: Sequence[SuspectedBias]) -> list[SuspectedBias]:
     """Return the terms that explain about as much of the learner as a cause does."""
     most = min(max(_AS_CLOSE * (1 - explains(cause)), _CLOSE), 1 - LEAST_SHARE)
     return [entry for entry in table if entry is not cause and 1 - explains(entry) <= most]
 
 
-def _parameter_shift(entry: TermBias) -> Vector:
+def _parameter_shift(entry: SuspectedBias) -> Vector:
     """Return the parameters moved by a term of the size found."""
     return (entry.coefficient_found or 0.0) * entry.per_unit
 
 
 def _of_learner(
     fit: MotionEstimate,
-    table: Sequence[TermBias],
-    smooth: Sequence[TermBias],
-    families: Sequence[TermBias] = (),
+    table: Sequence[SuspectedBias],
+    smooth: Sequence[SuspectedBias],
+    families: Sequence[SuspectedBias] = (),
 ) -> _Causes | None:
     """Return the term that explains most of the learner, or one of each equation.
 
@@ -277,8 +269,8 @@ def _of_learner(
 
 
 def one_of_each(
-    linearization: MotionLinearization, table: Sequence[TermBias]
-) -> list[list[TermBias]]:
+    linearization: MotionTerms, table: Sequence[SuspectedBias]
+) -> list[list[SuspectedBias]]:
     """Return terms of each learned equation, ordered by their joint share of the learner.
 
     The share of a term is that beside the first of the other equations.
@@ -287,13 +279,13 @@ def one_of_each(
     equation alone explain any of it.
     """
     seen = [entry for entry in table if entry.seen and entry.explained]
-    places = [entry.suspect.place(linearization.motion) for entry in seen]
+    places = [entry.equation or "" for entry in seen]
     groups = [np.flatnonzero(np.equal(places, place)) for place in dict.fromkeys(places)]
     if len(groups) < 2:
         return []
     values = (
-        *(linearization.beside(linearization.held(entry.suspect)) for entry in seen),
-        linearization.unshared_learner(),
+        *(linearization.linearization.residual(linearization.values(e.suspect)) for e in seen),
+        np.asarray(linearization.linearization.unshared_learner),
     )
     rows = np.stack([row[:: 1 + len(row) // CERTIFIED_POINTS].ravel() for row in values])
     sizes = np.linalg.norm(rows, axis=1)
@@ -329,10 +321,10 @@ def one_of_each(
 
 
 def _weigh_causes(
-    linearization: MotionLinearization | None,
-    each: Sequence[Sequence[TermBias]],
+    linearization: MotionTerms | None,
+    each: Sequence[Sequence[SuspectedBias]],
     share: float,
-    table: Sequence[TermBias],
+    table: Sequence[SuspectedBias],
 ) -> _Causes:
     """Return causes with the uncertainty of their sizes, and with their rivals.
 
@@ -352,12 +344,14 @@ def _weigh_causes(
             for rival, by in zip(near, apart, strict=True)
             if np.any(by > _ELSEWHERE * np.abs(bias))
         ]
-    after = [] if linearization is None else linearization.after(causes, table)
+    after = []
+    if linearization is not None and all(cause.seen for cause in causes):
+        after = table_beside(linearization, causes, [entry for entry in table if entry.seen])
     unsure += [_parameter_shift(max(after, key=explains))] if after else []
     return _Causes(causes, share, bias, np.array(unsure), tuple(rivals))
 
 
-def _of_residual(table: Sequence[TermBias]) -> _Causes | None:
+def _of_residual(table: Sequence[SuspectedBias]) -> _Causes | None:
     """Return the term that lowers the residual most, if it is significant and explains most of it.
 
     Most is of the part that is no white noise.

@@ -25,8 +25,8 @@ from orthaug.analysis.design import (
     search_input,
     set_known,
 )
-from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
+from orthaug.analysis.suspects import MotionSuspect
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.integrators import inputs_at_points

@@ -228,7 +228,7 @@ def _term(
 
 def _equation(job: Job, equation: str | None) -> str | None:
     """Return the state whose equation a term is added to; None for a term of an output."""
-    from orthaug.analysis.motion_suspects import equations_of, usual_places
+    from orthaug.physics.suspected_motion import equations_of, usual_places
 
     motion = job.problem.motion
     if equation is None:

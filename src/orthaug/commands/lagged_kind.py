@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
+from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.lagged_job import LaggedJob
 from orthaug.commands.suspects import declare_suspects
@@ -296,18 +296,16 @@ def _with_biases(
     ]
 
 
-def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization:
+def _linearization(job: LaggedJob, fit: Estimate | None) -> LaggedTerms:
     problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None
-        return MeasureLinearization(
-            weighed, problem, problem.least_squares, job.physics, None, along
-        )
+        return LaggedTerms(weighed, problem, problem.least_squares, job.physics, None, along)
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
     learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
-    return MeasureLinearization(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+    return LaggedTerms(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
 def _shared_warnings(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:

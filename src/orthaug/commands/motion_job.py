@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.progress import SILENT, Progress
-from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.analysis.suspects import MotionSuspect
 from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.parts import Part, load_parts

@@ -127,12 +127,13 @@ def _biases(job: MotionJob, trial: Trial) -> list[dict[str, Any]] | None:
 
     None where physics alone has no run.
     """
-    from orthaug.analysis.motion_bias import linearize_physics
+    from orthaug.analysis.bias import bias_table
+    from orthaug.analysis.free_run_bias import linearize_physics
 
     linearization = linearize_physics(trial.task, job.structure)
     if linearization is None:
         return None
-    table = linearization.table(job.suspects or linearization.usual())
+    table = bias_table(linearization, job.suspects or linearization.usual())
     return [entry.as_dict() for entry in table if job.suspects or entry.size]
 
 
@@ -218,8 +219,8 @@ def _analyse(
 
     Warnings are added.
     """
+    from orthaug.analysis.free_run_bias import suspected_bias
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_bias import suspected_bias
     from orthaug.analysis.motion_budget import declared_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
