@@ -28,8 +28,10 @@ from orthaug import (
     synthetic,
 )
 from orthaug.analysis.bias import bias_table
-from orthaug.analysis.budget import SURE_SHARE, budget_on, linearization_of, near_causes
+from orthaug.analysis.budget import SURE_SHARE, budget_on
 from orthaug.analysis.catalogue import Catalogue
+from orthaug.analysis.causes import near_causes
+from orthaug.analysis.measure_bias import linearization_of
 from orthaug.analysis.missing_lags import missing_lags
 
 LINEAR = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("c", "u[k-1]")])
@@ -259,8 +261,8 @@ def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
     fit = tank(zone=5.0)
     found = bias_budget(fit)
     assert found is not None and found.share < SURE_SHARE
-    ground = linearization_of(fit, Training())
-    near = near_causes(ground, found.cause, ())
+    *_, considered = linearization_of(fit, Training()).considered([])
+    near = near_causes(found.cause, considered.every, ())
     assert near and all(
         0.5 * found.share <= (entry.explained or 0) <= found.share for entry in near
     )
@@ -273,7 +275,7 @@ def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
         f"next: {near[0].suspect.name}" in warning.text
         and "If this term is the cause: " in warning.text
     )
-    assert near_causes(ground, found.cause, [found.cause.suspect]) == []
+    assert near_causes(found.cause, considered.every, [found.cause.suspect]) == ()
 
 
 def test_no_cause_no_bias():
@@ -352,7 +354,6 @@ def test_an_output_without_a_cause_widens_what_it_could_bias():
     budgets = [
         budget_on(
             replace(ground, learned=np.stack([ground.learned[:, 0], s * size * parts], axis=1)),
-            fit,
             declared,
         )
         for s in (0.0, 0.3)

@@ -12,9 +12,10 @@ from test_motion_fit import WHOLE, data, positive, spring
 import orthaug as oa
 from orthaug import InputError
 from orthaug.analysis.bias import bias_table, table_beside
+from orthaug.analysis.budget import budget_by, budget_on
 from orthaug.analysis.catalogue import Catalogue
-from orthaug.analysis.free_run_bias import linearize_fit, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of
+from orthaug.analysis.causes import Considered, explain_learner, one_of_each, rivals_of
+from orthaug.analysis.free_run_bias import linearize_fit
 
 FRICTION = oa.MotionSuspect.of(
     "expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction"
@@ -24,6 +25,29 @@ HARDENING = oa.MotionSuspect.of(
 )
 SUSPECTS = (FRICTION, HARDENING)
 TRUTH = np.array([1.0, 0.8, 25.0])
+
+
+def motion_budget(fit, table, smooth=()):
+    """The budget by given terms alone."""
+    terms, declared = linearize_fit(fit), [entry.suspect for entry in table]
+    if terms.learned is None:
+        return budget_on(terms, declared, table)
+    considered = Considered(table, smooth, joint=True, seen_only=True)
+    causes = explain_learner(terms, considered, declared)
+    return None if causes is None else budget_by(terms, [causes], declared=declared)
+
+
+def declared_budget(fit, declared, table=None):
+    """The budget by declared terms, and by usual ones where these are not sure."""
+    return budget_on(linearize_fit(fit), declared, table)
+
+
+def softened_bias(fit, suspects):
+    return linearize_fit(fit).softened(suspects)
+
+
+def usual_biases(fit):
+    return linearize_fit(fit).usual_biases()
 
 
 @pytest.fixture(scope="module")
@@ -435,7 +459,7 @@ def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(
     masses, points, monkeypatch
 ) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""
-    monkeypatch.setattr("orthaug.analysis.motion_budget.CERTIFIED_POINTS", points)
+    monkeypatch.setattr("orthaug.analysis.causes.MOST_POINTS", points)
     ground, table = linearize_fit(masses), usual_biases(masses)[0]
     names = [entry.suspect.name for entry in table]
     one, two = (

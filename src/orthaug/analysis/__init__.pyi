@@ -1,5 +1,5 @@
 from . import signals as signals
-from .budgets import bias_budget as bias_budget
+from .budget import bias_budget as bias_budget
 from .design import design_input as design_input
 from .diagnosis import diagnose as diagnose
 from .free_run_bias import suspected_bias as suspected_bias

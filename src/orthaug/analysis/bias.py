@@ -178,6 +178,13 @@ class SuspectedBias:
         return self.explained or 0.0
 
     @property
+    def coefficient(self) -> float:
+        """The size of the term found in the learner, else by what the free run leaves."""
+        if self.explained is None and self.residual is not None:
+            return self.residual.coefficient
+        return self.coefficient_found or 0.0
+
+    @property
     def removed_by(self) -> RemovedBy | None:
         """Change that removes this bias; None where none is known, or nothing is to remove.
 

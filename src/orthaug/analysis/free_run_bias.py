@@ -8,8 +8,8 @@ equations over the measure's points for Φ.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,8 +17,17 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import complementary_parameters
-from orthaug.analysis.bias import ResidualStep, SuspectedBias, TermResponse, bias_table
+from orthaug.analysis.bias import (
+    ResidualStep,
+    SuspectedBias,
+    TermResponse,
+    bias_table,
+    seen_table,
+)
+from orthaug.analysis.bias_hull import MOST_PHYSICS
 from orthaug.analysis.catalogue import Catalogue, soften_jumps
+from orthaug.analysis.causes import MOST_POINTS, SURE_SHARE, Considered
+from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.robustness import block_of
 from orthaug.analysis.suspects import MotionSuspect, check_motion_suspects
@@ -26,6 +35,7 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
+from orthaug.inference.covariance import reach
 from orthaug.inference.linearization import Linearization
 from orthaug.inference.motion_split import (
     Field,
@@ -41,8 +51,9 @@ from orthaug.physics.shared import SharedDirections, moves
 from orthaug.physics.suspected_motion import equations_of
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
-# Of a measure at most, over which certificates and terms of each equation are sought
-CERTIFIED_POINTS = 20_000
+# Of the learned equations: a learner that is smaller, and biases nothing, found nothing
+_NOTHING = 0.01
+_UNMOVED = 0.1  # standard errors of every parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +75,9 @@ class MotionTerms:
     unknown: tuple[str, ...] = ()
     slope: Matrix | None = None
     """How p̂ follows (c, w) of a fit (np, np + nw); None where that is not known."""
-    used: float | None = None
-    """Weights that a fit used, where its residual is to be used."""
-    steps: int | None = None
-    """Of a block, where the errors of that fit are coloured."""
+    fit: MotionEstimate | None = None
 
-    physical = None
+    physical = map = None
 
     @property
     def motion(self) -> Motion:
@@ -94,8 +102,12 @@ class MotionTerms:
         return np.where(np.isin(self.names, self.unknown), np.nan, slopes)
 
     @property
+    def bounds(self) -> Matrix:
+        return np.array([[p.min, p.max] for p in self.motion.parameters])
+
+    @property
     def certifies(self) -> bool:
-        return len(self.field.x) <= CERTIFIED_POINTS
+        return len(self.field.x) <= MOST_POINTS
 
     @property
     def linearization(self) -> Linearization:
@@ -158,8 +170,9 @@ class MotionTerms:
         seen = self.sees(suspects)
         residuals: list[ResidualStep | None] = [None] * len(suspects)
         # What the learner sees it has taken from the residual
-        if self.used is not None and not all(seen):
-            residuals = residual_steps(response, self.used, self.steps)
+        if self.fit is not None and not all(seen):
+            steps = block_of(self.fit) if self.fit.plain_covariance is not None else None
+            residuals = residual_steps(response, self.fit.effective_weights, steps)
         rows = enumerate(zip(suspects, seen, residuals, strict=True))
         return [self._response(response, k, *row) for k, row in rows]
 
@@ -191,6 +204,83 @@ class MotionTerms:
 
     def expected_shifts(self, bias: Vector) -> None:
         return None
+
+    def considered(
+        self, declared: Sequence[MotionSuspect], named: Sequence[SuspectedBias] | None = None
+    ) -> Iterator[Considered]:
+        """Yield the declared suspects, then the usual ones that the learner sees beside them.
+
+        Families and smooth forms of friction are tried both times: a motion's term is declared for
+        its size, which another form would change, so that nine tenths are enough for it only then.
+        """
+        if named is None:
+            named = bias_table(self, declared)
+        soft, families = self.softened(declared), self.families()
+        options: dict[str, Any] = {"families": families, "joint": True, "seen_only": True}
+        if named:
+            yield Considered(named, soft, enough=SURE_SHARE, **options)
+        usual, softer = self.usual_biases()
+        yield Considered((*named, *usual), (*soft, *softer), **options)
+
+    def softened(self, suspects: Sequence[MotionSuspect]) -> list[SuspectedBias]:
+        """Return the biases by smooth forms of the friction among the suspects.
+
+        Widths follow the size of the variable. Nothing without a learner: it alone shows the shape
+        of what is missing.
+        """
+        if self.learned is None:
+            return []
+        smooth = soften_jumps(suspects, self.motion, self.value, self.field.x, self.field.u)
+        return bias_table(self, smooth)
+
+    def usual_biases(self) -> tuple[list[SuspectedBias], list[SuspectedBias]]:
+        """Return the biases by usual terms that nobody declared, and by their smooth forms.
+
+        Only terms that the learner sees count: others are no likely cause. There is none where the
+        learner could imitate no change of a parameter.
+        """
+        if self.learned is None or not self.shared.basis.shape[1]:
+            return [], []
+        usual = self.usual()
+        seen = [one for one, sees in zip(usual, self.sees(usual), strict=True) if sees]
+        smooth = soften_jumps(seen, self.motion, self.value, self.field.x, self.field.u)
+        table = bias_table(self, (*seen, *smooth))  # one program for all
+        return table[: len(seen)], table[len(seen) :]
+
+    def families(self) -> list[SuspectedBias]:
+        """Return the biases by every member of a family that the learner sees.
+
+        Nothing where it could imitate no parameter.
+        """
+        if self.learned is None or not self.shared.basis.shape[1]:
+            return []
+        table = seen_table(self, self.catalogue.families())
+        return [entry for entry in table if (entry.physics_cosine or 0.0) <= MOST_PHYSICS]
+
+    def parts(self) -> list[tuple[str | None, MotionTerms]]:
+        """Return the learner as one part: its equations share parameters (`Considered.joint`)."""
+        return [(None, self)]
+
+    def is_negligible(self, bias: Vector) -> bool:
+        """Return whether the learner is tiny, and biases by little more than nothing."""
+        fit = self.fit
+        if fit is None or self.learned is None or (fit.split_by.share or 0.0) >= _NOTHING:
+            return False
+        std = np.full(len(bias), np.nan) if fit.std is None else fit.std
+        return not np.any(np.abs(bias) > _UNMOVED * std)
+
+    def noise_share(self) -> float:
+        """Return ν, the share of noise in the learner, by the band of the learned curve."""
+        fit, own = self.fit, np.asarray(self.linearization.unshared_learner)
+        half = None if fit is None else learned_reach(fit, self.field.x, self.field.u)
+        if fit is None or half is None or not np.isfinite(half).all():
+            return 0.0
+        noise = np.sum(self.weigh(half / reach(fit.freedom)) ** 2)
+        return float(noise / max(np.sum(own**2), np.finfo(float).tiny))
+
+    def remedies(self, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
+        """Return no remedies: other inputs or measures would need another free run."""
+        return []
 
     def sees(self, suspects: Sequence[MotionSuspect]) -> list[bool | None]:
         """Return whether each acts where the learner does, and is a function of its inputs."""
@@ -269,40 +359,7 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
     )
     check_motion_suspects(suspects, fit.problem)
     terms = linearize_fit(fit)
-    if terms is None or not suspects:
-        return []
-    steps = block_of(fit) if fit.plain_covariance is not None else None
-    return bias_table(replace(terms, used=fit.effective_weights, steps=steps), suspects)
-
-
-def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> list[SuspectedBias]:
-    """Return the biases by smooth forms of the friction among the suspects.
-
-    Widths follow the size of the variable.
-
-    Nothing without a learner: it alone shows the shape of what is missing.
-    """
-    if fit.model.form.bound is None:
-        return []
-    field = fit.split_by.field
-    smooth = soften_jumps(suspects, fit.problem.motion, fit.values, field.x, field.u)
-    return suspected_bias(fit, smooth) if smooth else []
-
-
-def usual_biases(fit: MotionEstimate) -> tuple[list[SuspectedBias], list[SuspectedBias]]:
-    """Return the biases by usual terms that nobody declared, and by their smooth forms.
-
-    Only terms that the learner sees count: others are no likely cause. There is none where the
-    learner could imitate no change of a parameter.
-    """
-    terms = linearize_fit(fit)
-    if terms is None or not terms.learns or not fit.shared.basis.shape[1]:
-        return [], []
-    usual = terms.usual()
-    seen = [one for one, sees in zip(usual, terms.sees(usual), strict=True) if sees]
-    smooth = soften_jumps(seen, fit.problem.motion, fit.values, terms.field.x, terms.field.u)
-    table = bias_table(terms, (*seen, *smooth))  # one program for all
-    return table[: len(seen)], table[len(seen) :]
+    return [] if terms is None else bias_table(terms, suspects)
 
 
 def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
@@ -320,7 +377,8 @@ def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
-    return MotionTerms(place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+    own = (place, fit.theta, fit.shared, field, learned, unknown, fit.split_by.slope)
+    return MotionTerms(*own, fit)
 
 
 def linearize_physics(task: MotionTask, structure: Structure) -> MotionTerms | None:

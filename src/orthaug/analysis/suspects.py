@@ -293,7 +293,7 @@ class MotionSuspect:
     factor: str | None = None
     """Of a term with memory; of another it is part of the expression."""
 
-    output = None  # in the words of lagged suspects
+    output = on = None  # in the words of lagged suspects
 
     def __post_init__(self) -> None:
         check_name(self.name)

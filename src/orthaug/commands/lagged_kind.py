@@ -257,10 +257,10 @@ def _bias_of(job: LaggedJob, fit: Estimate | None = None) -> list[dict[str, Any]
     """
     if not job.problem.baseline.names:
         return []
-    linearization = _linearization(job, fit)
+    terms = _terms(job, fit)
     return bias_under(
-        linearization,
-        declare_suspects(job.spec.suspects, linearization.problem),
+        terms,
+        declare_suspects(job.spec.suspects, terms.problem),
         certify_usual=fit is None,
     )
 
@@ -271,8 +271,8 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
 
     if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
         return None
-    linearization = _linearization(job, fit)
-    return budget_on(linearization, fit, declare_suspects(job.spec.suspects, linearization.problem))
+    terms = _terms(job, fit)
+    return budget_on(terms, declare_suspects(job.spec.suspects, terms.problem))
 
 
 def _with_biases(
@@ -296,7 +296,7 @@ def _with_biases(
     ]
 
 
-def _linearization(job: LaggedJob, fit: Estimate | None) -> LaggedTerms:
+def _terms(job: LaggedJob, fit: Estimate | None) -> LaggedTerms:
     problem, weighed, structure = job.problem, job.weighed, job.spec.declared_structure()
     if fit is None:
         along = directions(structure, problem) if job.spec.declared_learner() is not None else None
@@ -305,7 +305,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> LaggedTerms:
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
     learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
-    return LaggedTerms(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
+    return LaggedTerms(weighed, problem, fit.theta, job.physics, learned, fit.model.shared, fit)
 
 
 def _shared_warnings(job: LaggedJob, fit: Estimate | None = None) -> list[Warning]:

@@ -21,8 +21,8 @@ from orthaug.reports.result import (
 )
 
 if TYPE_CHECKING:
+    from orthaug.analysis.budget import Budget
     from orthaug.analysis.input_timing import Trial
-    from orthaug.analysis.motion_budget import MotionBudget
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
@@ -219,16 +219,18 @@ def _analyse(
 
     Warnings are added.
     """
-    from orthaug.analysis.free_run_bias import suspected_bias
+    from orthaug.analysis.bias import bias_table
+    from orthaug.analysis.budget import budget_on
+    from orthaug.analysis.free_run_bias import linearize_fit
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_budget import declared_budget
     from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
     def biases() -> Any:
-        table = suspected_bias(fit, job.suspects) if job.suspects else []
-        budget = declared_budget(fit, job.suspects, table)
+        terms = linearize_fit(fit)
+        table = [] if terms is None else bias_table(terms, job.suspects)
+        budget = None if terms is None else budget_on(terms, job.suspects, table)
         warnings.extend(budget.warnings if budget else ())
         listed = {entry.suspect for entry in table}
         usual = [
@@ -304,7 +306,7 @@ def physics_alone(
     return {part: free.physics_alone for part, (_, free) in responses.items()}
 
 
-def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[ParameterResult]:
+def _parameters(fit: MotionEstimate, budget: Budget | None) -> list[ParameterResult]:
     """Return the parameters with intervals, whether the learner could imitate them, and biases."""
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
