@@ -220,9 +220,16 @@ def test_experiments_of_one_kind_do_not_differ() -> None:
     assert np.all((found.ratio > 0.4) & (found.ratio < 1.8)) and found.larger == ()
 
 
-def test_what_has_none() -> None:
+def test_what_has_none(tmp_path: Path) -> None:
     record = record_of(7, 4, 60)
     assert oa.estimate(record_of(7, 2), PHYSICS, learner=None).over_experiments is None
+    u, y = response(np.random.default_rng(9), 120)
+    y[[30, 60, 90]] = np.nan
+    table = np.column_stack([u, y])
+    np.savetxt(tmp_path / "torn.csv", table, delimiter=",", header="u,y", comments="")
+    torn = oa.read_record(tmp_path / "torn.csv", inputs=["u"], outputs=["y"], missing="skip")
+    assert len(torn.experiments) == 4 and torn.recordings == (0, 0, 0, 0)
+    assert oa.estimate(torn, PHYSICS, learner=None).over_experiments is None, "one recording, torn"
     additive = oa.estimate(record, PHYSICS, learner=oa.MLP(hidden=(2,)), structure=oa.Additive())
     assert additive.over_experiments is None, "its θ is not unique"
     lone = [Record.from_arrays(u=np.zeros(50), y=np.zeros(50)) for _ in range(3)]

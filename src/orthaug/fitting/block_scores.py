@@ -104,8 +104,8 @@ class FreeRunScores:
         )
         return scores[counts > 0]
 
-    def by_experiment(self, record: Record, washout: int) -> Float[np.ndarray, "E n"] | None:
-        """Return the score of every experiment, in the units of the model's Gram matrix.
+    def by_recording(self, record: Record, washout: int) -> Float[np.ndarray, "E n"] | None:
+        """Return the score of every recording, in the units of the model's Gram matrix.
 
         None where the segments are not those of the record's experiments.
 
@@ -113,18 +113,17 @@ class FreeRunScores:
             washout: leading steps of a segment that are not scored.
         """
         segments = self.blocks(self.longest)
-        steps, rows = (
-            self.segments.steps,
-            [len(e) - self.dynamics.first_row for e in record.experiments],
-        )
+        steps = self.segments.steps
+        rows = [len(experiment) - self.dynamics.first_row for experiment in record.experiments]
         counts = [len(begins_of(count, steps, min(washout, steps - 1))) for count in rows]
         if sum(counts) != len(segments):
             counts = [1] * len(rows)  # whole experiments, or the first rows of each
         if sum(counts) != len(segments):
             return None
-        ends = np.cumsum(counts)[:-1]
-        own = [part.sum(axis=0) for part in np.split(segments, ends)]
-        return self.share * self.unit * np.stack(own)
+        owner = np.repeat(record.recordings, counts)
+        found = np.zeros((owner[-1] + 1, segments.shape[1]))
+        np.add.at(found, owner, segments)
+        return self.share * self.unit * found
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
         """Return the sensitivities of p on every scored step, the starts eliminated.

@@ -142,7 +142,7 @@ class AnyFit(FitView):
         """
         if self.covariance is None or self.model.numbers.tilt is not None:
             return None
-        if len(self.problem.record.experiments) < FEWEST:
+        if self.problem.record.recordings[-1] + 1 < FEWEST:
             return None
         changes = self._changes_without_each()
         return None if changes is None else self._over_experiments(changes)
@@ -166,7 +166,7 @@ class AnyFit(FitView):
         statistics, moves = self.model.statistics, self.moves_by()
         if self.scores is None or statistics.gram is None or moves is None:
             return None
-        scores = self.scores.by_experiment(self.problem.record, free_run.washout)
+        scores = self.scores.by_recording(self.problem.record, free_run.washout)
         if scores is None:
             return None
         k, free = moves
@@ -504,8 +504,8 @@ class Estimate(AnyFit):
         problem, split = self.problem, self.measure
         if self.at_bound or isinstance(problem, StreamedProblem):
             return None
-        experiments = len(problem.lengths)
-        owner = np.repeat(np.arange(experiments), problem.lengths)
+        recordings = problem.record.recordings
+        experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
         whole = split is None and self.model.shared is None
         if self.criterion.one_step and (whole or self.model.form.bound is None):
             return split_without_each(

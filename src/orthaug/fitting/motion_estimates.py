@@ -239,7 +239,7 @@ class MotionEstimate(AnyFit):
         changes = self._changes_of_free_run(free_run)
         if changes is None or self.model.form.bound is None:
             return changes
-        owner, field = self.segmented.experiment_of_points(), self.split_by.field
+        owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):
             return changes
         basis, motion = self.shared.basis, self.problem.motion

@@ -216,13 +216,13 @@ class SegmentedMotion(SegmentedProblem):
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
-    def experiment_of_points(self) -> Int[np.ndarray, "N"]:
-        """Return the number of the experiment of each point of `trajectory`."""
+    def recording_of_points(self) -> Int[np.ndarray, "N"]:
+        """Return the number of the recording of each point of `trajectory`."""
         steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         counts = scored.reshape(-1, steps).sum(axis=1)
         pieces = [len(begins_of(len(e), steps, washout)) for e in self.record.experiments]
-        segments = np.repeat(np.arange(len(pieces)), pieces)
+        segments = np.repeat(self.record.recordings, pieces)
         return np.repeat(segments, counts[: len(segments)])
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
