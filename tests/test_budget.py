@@ -272,8 +272,7 @@ def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
     )
     assert len({entry.suspect.on or entry.suspect.expression for entry in near}) == len(near)
     assert (
-        f"next: {near[0].suspect.name}" in warning.text
-        and "If this term is the cause: " in warning.text
+        f"next: {near[0].suspect.name}" in warning.text and "If this is the cause: " in warning.text
     )
     assert near_causes(found.cause, considered.every, [found.cause.suspect]) == ()
 

@@ -473,13 +473,11 @@ def _biased_warning(
     if learns and causes.share < SURE_SHARE:
         near = ", ".join(f"{entry.suspect.name} {percent(entry.share)}" for entry in causes.near)
         beside = f"; next: {near}" if near else ""
-        one = "These terms" if several else "This term"
-        if_so = "these terms are" if several else "this term is"
         return Warning(
             "biased",
             f"what the learner found{where} looks most like {listed} ({percent(causes.share)} of "
-            f"it{beside}). {one} would move {moves}; the standard errors do not cover this "
-            f"bias{other}{f'. If {if_so} the cause: {cure}' if cure else ''}.",
+            f"it{beside}). This would move {moves}; the standard errors do not cover this "
+            f"bias{other}{f'. If this is the cause: {cure}' if cure else ''}.",
         )
     what = f"the learner{where}" if learns else "the free run's squared error"
     return Warning(

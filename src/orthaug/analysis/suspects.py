@@ -115,8 +115,10 @@ class Suspect:
     def __post_init__(self) -> None:
         check_name(self.name)
         if not isinstance(self.output, str | None):
-            text = f"`output` must be the name of a channel; got {self.output!r}."
-            raise InputError(f"suspect '{self.name}': {text}")
+            raise InputError(
+                f"suspect '{self.name}': `output` must be the name of a channel; got "
+                f"{self.output!r}."
+            )
         constants = _checked_constants(dict(self.constants), self.name)
         check_coefficient(self.name, self.coefficient)
         object.__setattr__(self, "constants", constants)
