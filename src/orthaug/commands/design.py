@@ -10,7 +10,8 @@ import numpy as np
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug.analysis.design import MOST_SAMPLES, Design, design_input
+from orthaug.analysis.design import MOST_SAMPLES, design_input, design_motion_input
+from orthaug.analysis.input_search import Design
 from orthaug.commands.job import Job
 from orthaug.commands.motion_job import MotionJob
 from orthaug.commands.suspects import declare_suspects
@@ -66,7 +67,6 @@ def _of_lags(job: Job, asked: dict[str, Any], noise: float | None) -> Design:
 
 
 def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> Design:
-    from orthaug.analysis.motion_design import design_motion_input
     from orthaug.fitting.motion_estimation import without_learner
     from orthaug.fitting.motion_task import MotionTask
 

@@ -221,9 +221,9 @@ def _analyse(
     """
     from orthaug.analysis.bias import bias_table
     from orthaug.analysis.budget import budget_on
+    from orthaug.analysis.diagnosis import diagnose
     from orthaug.analysis.free_run_bias import linearize_fit
     from orthaug.analysis.learned_part import equation_parts
-    from orthaug.analysis.motion_diagnosis import diagnose_motion
     from orthaug.analysis.motion_modes import motion_stability
     from orthaug.analysis.motion_response import substep_bias
 
@@ -243,7 +243,7 @@ def _analyse(
     found = {
         "residuals": attempt_warned(
             "the analysis of the residual",
-            lambda: diagnose_motion(fit, free_run),
+            lambda: diagnose(fit, free_run=free_run),
             warnings,
             _NOT_ANALYSED,
         ),
