@@ -48,7 +48,7 @@ class Considered:
     """Share from which on a cause among them is named."""
     joint: bool = False
     """Whether terms of several equations explain the learner together. A term of a motion, such as
-    a force between two masses, stands in several equations and moves parameters that they share;
+    a force between two masses, acts in several equations and moves parameters that they share;
     outputs of difference equations are looked at one by one instead.
     """
     seen_only: bool = False
