@@ -43,6 +43,7 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.output_weights import by_covariance
 from orthaug.physics.problem import Problem, pose
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
+from orthaug.physics.systems import System
 
 _TURNS = 30
 _SETTLED = 1e-6  # relative change of W
@@ -111,11 +112,13 @@ def estimate(
     record: Record | Source, baseline: Baseline, **options: Unpack[Options]
 ) -> Estimate: ...
 @overload
-def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
+def estimate(
+    record: Record, baseline: Motion | System, **options: Unpack[Options]
+) -> MotionEstimate: ...
 @with_progress
 def estimate(
     record: Record | Source,
-    baseline: Baseline | Motion,
+    baseline: Baseline | Motion | System,
     *,
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
@@ -145,7 +148,8 @@ def estimate(
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
             where they are.
-        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
+        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`. A `System`, such
+            as `HammersteinWiener(order=2)`, writes a motion for the record.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
@@ -207,6 +211,10 @@ def estimate(
         "validation": validation,
         "progress": progress,
     }
+    if isinstance(baseline, System):
+        check_record(record, moves=True)
+        assert isinstance(record, Record)
+        baseline = baseline.motion(record)
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError(
