@@ -90,8 +90,8 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
     It runs in the same compiled programs.
     """
-    solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
-    posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
+    solver, learner = LevenbergMarquardt().within_limit, fit.model.form.bound.learner
+    posed = fit.problem if fit.learns else without_learner(fit.problem)
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
@@ -143,11 +143,7 @@ def _words(
         noise = "is white: noise on the outputs, which the training assumes."
         return f"The free run's error ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
-        learner = (
-            "that the learner does not see"
-            if fit.model.form.bound is not None
-            else "(a learner would show which)"
-        )
+        learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
         no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
             f"The free run's error ({sizes}) is coloured ({_colour(tests, shares)}). It follows "

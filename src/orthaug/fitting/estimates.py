@@ -96,6 +96,11 @@ class AnyFit(FitView):
         """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
         return self.model.theta
 
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.model.learns
+
     @cached_property
     def terms(self) -> pd.DataFrame:
         """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
@@ -422,8 +427,6 @@ class Estimate(AnyFit):
         if self.measure is not None and self.measure.slope is not None:
             return self.measure.slope
         problem = self.problem
-        if self.model.form.bound is None:
-            return np.zeros((len(self.theta), 0))
         if isinstance(problem, StreamedProblem):
             return streamed_slope(self.model, problem)
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
@@ -459,11 +462,9 @@ class Estimate(AnyFit):
         )
 
     def lines(self) -> list[str]:
-        baseline, bound, learner = self.problem.baseline, self.model.form.bound, "none"
-        if bound is not None:
-            learner = (
-                f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
-            )
+        baseline, learner = self.problem.baseline, str(self.model.form.bound)
+        if self.learns:
+            learner += f", {self.effective_weights:.1f} effective"
         lines = [
             f"structure   {self.model.structure}",
             f"learner     {learner}",

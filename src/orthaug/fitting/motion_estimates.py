@@ -224,7 +224,7 @@ class MotionEstimate(AnyFit):
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
         seen = ", ".join(str(entry) for entry in form.features)
         learner = "none"
-        if bound is not None:
+        if self.learns:
             learner = (
                 f"{bound.learner} of {seen}, {bound.size} weights, "
                 f"{self.effective_weights:.1f} effective"
@@ -237,7 +237,7 @@ class MotionEstimate(AnyFit):
             f"data        {self.problem.record!r}",
             *self.status.lines,
         ]
-        if bound is not None:
+        if self.learns:
             lines += [
                 f"shared      {shared_in_words(self.shared)}",
                 f"measure     {self.split_by.name}",
@@ -270,7 +270,7 @@ def _with_split(
     warnings = [
         *of_measure,
         *_ill_conditioned(fit, split),
-        *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
+        *_doubts(split, at_bound, unseen, fit.learns),
     ]
     model = replace(
         fit.model,

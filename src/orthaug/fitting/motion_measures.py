@@ -52,7 +52,7 @@ def field_under(
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
     warnings = ()
-    if share < SUPPORTED and form.bound is not None:
+    if share < SUPPORTED and form.learns:
         text = (
             f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
             "training data: elsewhere the parameters depend on the learner's extrapolation."

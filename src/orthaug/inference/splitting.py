@@ -105,11 +105,10 @@ def split_by_measure(
         f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
         "training data"
     )
-    learns = form.bound is not None
     warning = Warning(
         "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
     )
-    warnings = (warning,) if share < SUPPORTED and learns else ()
+    warnings = (warning,) if share < SUPPORTED and form.learns else ()
     condition = weighed.excitation.condition
     of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
@@ -135,7 +134,7 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
     """Return ∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
-    if bound is None or not bound.size:
+    if not bound.size:
         return np.zeros((nt, 0))
     gain = problem.weight.matrix * np.asarray(numbers.gain)
     row_builder = problem.row_builder(
@@ -156,7 +155,7 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: np
     """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
-    if bound is None or not bound.size:
+    if not bound.size:
         return np.zeros((nt, 0))
     engine = InMemory()
     rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
