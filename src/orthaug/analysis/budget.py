@@ -211,7 +211,7 @@ def lagged_budget(
     measure: Measure | None = None,
 ) -> Budget | None:
     """Return `bias_budget` of a fit of difference equations."""
-    if not fit.status.ok or fit.model.structure != "orthogonal" or not fit.learns:
+    if not fit.status.ok or fit.model.structure != "orthogonal":
         return None
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name

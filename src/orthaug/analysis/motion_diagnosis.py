@@ -19,7 +19,6 @@ from orthaug.analysis.predictability import Predictable, from_lags, from_own_pas
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import without_learner
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
@@ -91,8 +90,7 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     It runs in the same compiled programs.
     """
     solver, learner = LevenbergMarquardt().within_limit, fit.model.form.bound.learner
-    posed = fit.problem if fit.learns else without_learner(fit.problem)
-    return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
+    return dead_times(on_longest(fit.problem, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _colour_sentence(fit: MotionEstimate) -> str:

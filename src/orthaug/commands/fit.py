@@ -99,7 +99,8 @@ def with_advice(fitted: FitReport) -> FitReport:
 def with_verdict(fitted: FitReport) -> FitReport:
     """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
-    if not fit.status.ok or not (fit.learns or fit.held_out):
+    learns = fit.learns
+    if not fit.status.ok or not (learns or fit.held_out is not None):
         return fitted
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
@@ -111,13 +112,13 @@ def with_verdict(fitted: FitReport) -> FitReport:
         None,
     )
     warnings += failed
-    asked = fit.learns and job.spec.validation.blocks != 0
+    asked = learns and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
         why = "training was stopped too early for cross-validation" if _was_stopped(fit) else short
         text = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=text))
-    if verdict is not None and fit.learns:
+    if verdict is not None and learns:
         text = (
             *verdict.warnings,
             *_unexplained_warnings(fitted, None if verdict.code == "helps" else physics),

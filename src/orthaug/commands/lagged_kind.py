@@ -134,9 +134,7 @@ def content(
             "the bias that the learner implies", partial(_budget_of, job, fit), warnings, None
         )
     warnings += budget.warnings if budget else ()
-    if (
-        fit.model.structure != "orthogonal" or not fit.learns
-    ):  # a variant, not the declared structure
+    if fit.model.structure != "orthogonal":  # a variant, not the declared structure
         shared = None
     fields["parameters"] = _with_biases(
         rows, shared.determined if shared else None, budget, fit.at_bound
@@ -269,7 +267,7 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
     """Return the bias that what the learner found implies, under the spec's measure."""
     from orthaug.analysis.budget import budget_on
 
-    if fit.model.structure != "orthogonal" or not fit.learns:
+    if fit.model.structure != "orthogonal":
         return None
     linearization = _linearization(job, fit)
     return budget_on(linearization, fit, declare_suspects(job.spec.suspects, linearization.problem))

@@ -328,8 +328,9 @@ def fit(
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
-    ensemble = _check_ensemble(ensemble and task.bound.learns, problem)
-    if solved and not task.bound.learns:
+    alone = not task.bound.learns
+    ensemble = _check_ensemble(ensemble and not alone, problem)
+    if alone and solved:
         estimate = _physics_alone(task, structure)
     else:
         # Not a worker's disk

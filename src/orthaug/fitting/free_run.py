@@ -256,7 +256,7 @@ class FreeRunTask(SimulationTask):
             add(np.concatenate([self.warm, w]))
         elif not places:
             add(objective.begin(w))
-        if self.bound.learns and plan.free_run.start_iterations and self.warm is None:
+        if plan.free_run.start_iterations and self.warm is None:
             steps = plan.free_run.start_iterations
             short = LevenbergMarquardt(steps, solver.tolerance, longest=steps)
             begun = objective.begin(

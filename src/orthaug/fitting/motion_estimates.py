@@ -223,12 +223,16 @@ class MotionEstimate(AnyFit):
     def lines(self) -> list[str]:
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
         seen = ", ".join(str(entry) for entry in form.features)
-        learner = "none"
+        learner, split = str(bound), []
         if self.learns:
             learner = (
                 f"{bound.learner} of {seen}, {bound.size} weights, "
                 f"{self.effective_weights:.1f} effective"
             )
+            split = [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
         lines = [
             f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
@@ -236,12 +240,8 @@ class MotionEstimate(AnyFit):
             f"learner     {learner}",
             f"data        {self.problem.record!r}",
             *self.status.lines,
+            *split,
         ]
-        if self.learns:
-            lines += [
-                f"shared      {shared_in_words(self.shared)}",
-                f"measure     {self.split_by.name}",
-            ]
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]

@@ -120,7 +120,7 @@ class SegmentedLagged(SegmentedProblem):
         """Return the criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
         # The unknown is c
-        free = elimination.projects and not elimination.bounded and self.bound.learns
+        free = elimination.projects and not elimination.bounded
         bounds = elimination.lower.copy(), elimination.upper.copy()
         for i, value in self.fixed.items():
             bounds[0][i] = bounds[1][i] = value

@@ -7,6 +7,7 @@ measure θ depends on the learner, and shares its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 from orthaug.physics.streamed import RowBuilder, StreamedProblem
 
-SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
+_SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +102,28 @@ def split_by_measure(
     left = projection.along(model.shared) @ projection.coordinates(rest)
     defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    reach = (
-        f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-        "training data"
-    )
-    warning = Warning(
-        "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
-    )
-    warnings = (warning,) if share < SUPPORTED and form.learns else ()
+    warnings = warn_beyond_data(measure, share, form, "θ depends")
     condition = weighed.excitation.condition
     of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
         measure.name, theta, aux, covariance, defect, *of_measure, slope=slope, measure=measure
     )
+
+
+def warn_beyond_data(measure: Measure, share: float, form: Any, what: str) -> tuple[Warning, ...]:
+    """Return the warning that a learner extrapolates over most of a measure, or none.
+
+    Args:
+        share: of the measure within reach of the training data.
+        what: what depends on the learner there, with its verb.
+    """
+    if share >= _SUPPORTED or not form.learns:
+        return ()
+    text = (
+        f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
+        f"training data: elsewhere {what} on the learner's extrapolation."
+    )
+    return (Warning("measure_beyond_data", text),)
 
 
 @dataclass(frozen=True, eq=False)
