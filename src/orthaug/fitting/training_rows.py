@@ -95,6 +95,8 @@ class TrainingRows:
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
         """Return f at the training rows in memory, in the outputs' units."""
+        if not self.bound.learns:  # nothing to compile
+            return np.zeros_like(self.problem.target)
         return (
             from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
         )

@@ -361,8 +361,7 @@ class Bound:
     @classmethod
     def of(cls, learner: Learner | None, nz: int, ny: int) -> Bound:
         """Return a learner with its numbers; `NoLearner` sees no features."""
-        learner = declared(learner)
-        return cls(learner, nz if learns(learner) else 0, ny)
+        return cls(declared(learner), nz, ny) if learns(learner) else nothing_learned(ny)
 
     def __post_init__(self) -> None:
         tree = jax.eval_shape(lambda: self.learner.init(jax.random.key(0), self.nz, self.ny))
