@@ -510,7 +510,7 @@ class Estimate(AnyFit):
         recordings = problem.record.recordings
         experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
         whole = split is None and self.model.shared is None
-        if self.criterion.one_step and (whole or self.model.form.bound is None):
+        if self.criterion.one_step and (whole or not self.learns):
             return split_without_each(
                 problem.projection, None, problem.unexplained, owner, experiments
             )
@@ -521,7 +521,7 @@ class Estimate(AnyFit):
             else self._changes_of_free_run(free_run)
         )
         measure = Training() if split is None or split.measure is None else split.measure
-        if changes is None or not isinstance(measure, OF_ROWS) or self.model.form.bound is None:
+        if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
             return changes
         weighed = weigh_problem(measure, problem)
         values = times(weighed.unit, self.model.learner_at(weighed.points.x))

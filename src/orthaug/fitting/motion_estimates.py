@@ -237,7 +237,7 @@ class MotionEstimate(AnyFit):
         free_run = self.criterion.free_run
         assert free_run is not None, "a motion is trained on its free run"
         changes = self._changes_of_free_run(free_run)
-        if changes is None or self.model.form.bound is None:
+        if changes is None or not self.learns:
             return changes
         owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):
