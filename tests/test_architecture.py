@@ -75,8 +75,6 @@ CONCEPTS = {
     "fitting.recursive_storage": "the format of a saved recursive estimate",
     "fitting.segmented_streamed": "segments of rows that remain in a source",
     "models.devices": "an engine, an entry of the registry",
-    "models.lagged_storage": "the format of a saved lagged model",
-    "models.motion_storage": "the format of a saved motion",
     "reports.figures": "figures from Python",
     "reports.linear_text": "linear views in words",
     "reports.page_findings": "a section of the page",
