@@ -16,8 +16,8 @@ from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
-from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines

@@ -357,7 +357,8 @@ def _motion_fields(
     kept, trained = declared["trained"], None
     if kept is not None:
         own: dict[str, Any] = {key: int(kept[key]) for key in _SEGMENTATION}
-        trained = TrainedSegments(**own | {k: arrays.get(f"trained.{k}") for k in _ON_SEGMENTS})
+        own |= {key: arrays.get(f"trained.{key}") for key in _ON_SEGMENTS}
+        trained = TrainedSegments(**own)
     return {
         "form": form,
         "loose": arrays["loose"],
