@@ -206,7 +206,7 @@ def try_file(kind: str, seed: int, original: bytes, folder: Path) -> str:
 
 def try_spec(seed: int, text: str, folder: Path) -> str:
     """One mutation of a spec, opened with its data: what is accepted holds what the file says."""
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
 
     rng = np.random.default_rng([100, seed])
     path = folder / "spec.toml"

@@ -19,7 +19,6 @@ from orthaug.analysis.predictability import Predictable, from_lags, from_own_pas
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import without_learner
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
@@ -91,7 +90,9 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     It runs in the same compiled programs.
     """
     solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
-    posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
+    posed, learner = (
+        (fit.problem, bound.learner) if bound else (fit.problem.without_learner(), None)
+    )
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -168,8 +168,10 @@ class Estimate(AnyFit):
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
 
-    lagged: ClassVar[bool] = True
-    """Whether the model predicts from lagged signals, so that it has a residual one step ahead."""
+    @property
+    def values(self) -> Vector:
+        """The values of the parameters: θ̂."""
+        return self.theta
 
     @property
     def layout(self) -> Layout:
@@ -178,7 +180,8 @@ class Estimate(AnyFit):
 
     def reach(self, record: Record) -> Matrix:
         """Return the regressors (N, nx) of a record in the model's order of channels."""
-        return lag_rows(record, self.problem.layout)
+        own = record is self.problem.record
+        return self.problem.rows.x if own else lag_rows(record, self.problem.layout)
 
     @property
     def one_step_theta(self) -> Vector | None:
@@ -194,6 +197,15 @@ class Estimate(AnyFit):
     def std(self) -> Vector | None:
         """Standard errors of θ̂ (nθ,)."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+    @property
+    def plain_std(self) -> Vector | None:
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
+        """
+        plain = self.plain_covariance
+        return None if plain is None else np.sqrt(np.diag(plain))
 
     @property
     def interval(self) -> Matrix | None:

@@ -28,7 +28,8 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
-from orthaug.physics.motion_problem import MotionProblem, layout_of
+from orthaug.physics.excitation import Excitation, of_gram
+from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.shared import SharedDirections
 
 if TYPE_CHECKING:
@@ -88,12 +89,22 @@ class MotionEstimate(AnyFit):
     """The estimate of physics alone that the learner had to beat; None without a learner."""
     warnings: tuple[Warning, ...] = ()
 
-    lagged: ClassVar[bool] = False
+    one_step_theta: ClassVar[None] = None
+    """A motion has no least squares one step ahead."""
+
+    @property
+    def excitation(self) -> Excitation:
+        """Rank and condition of the parameters in the outputs of the fitted motion."""
+        names, gram = self.problem.names, self.model.statistics.gram
+        count = len(names)
+        if gram is None:
+            return Excitation(0, count, None, ())
+        return of_gram(gram[:count, :count], names)
 
     @property
     def layout(self) -> Layout:
         """Names of the entries of `reach`."""
-        return layout_of(self.problem.motion)
+        return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
         """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
