@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from orthaug.inference.measures import Measure
     from orthaug.models.response import Response
     from orthaug.models.rows import Engine
+    from orthaug.physics.parameters import PhysicsMap
     from orthaug.reports.drawing import Figure
     from orthaug.reports.findings import SuspectResult
     from orthaug.reports.page_fit import Origin
@@ -80,6 +81,8 @@ class JobPhysics(ABC):
     """Whether `check` computes free runs, for which JAX is needed."""
     most_trials: ClassVar[int]
     """Changes that advice tries: together they take about as long as the fit."""
+    map: PhysicsMap | None = None
+    """The map from physical parameters to θ, where the parameters are not physical themselves."""
 
     @classmethod
     @abstractmethod
