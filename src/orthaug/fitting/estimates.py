@@ -174,6 +174,22 @@ class AnyFit(FitView):
         half = half_inverse(information[np.ix_(free, free)], int(free[: len(self.theta)].sum()))
         return -scores[:, free] @ half @ (half.T @ k[:, free].T) * _left_out(len(scores))
 
+    def withheld(self, kind: str, why: Warning) -> Any:
+        """Return the fit without standard errors and intervals of θ, terms and predictions.
+
+        A warning says why.
+        """
+        fit: Any = self
+        statistics = replace(fit.model.statistics, middle=None)
+        return replace(
+            fit,
+            model=replace(fit.model, statistics=statistics),
+            covariance=None,
+            plain_covariance=None,
+            std_kind=kind,
+            warnings=(*fit.warnings, why),
+        )
+
     def lines(self) -> list[str]:
         """Return the lines of `summary` before its warnings."""
         raise NotImplementedError
@@ -335,20 +351,7 @@ class Estimate(AnyFit):
         )
 
     def withheld(self, kind: str, why: Warning) -> Estimate:
-        """Return the fit without standard errors and intervals of θ, terms and predictions.
-
-        A warning says why.
-        """
-        statistics = replace(self.model.statistics, middle=None)
-        return replace(
-            self,
-            model=replace(self.model, statistics=statistics),
-            covariance=None,
-            plain_covariance=None,
-            plain_statistics=None,
-            std_kind=kind,
-            warnings=(*self.warnings, why),
-        )
+        return replace(super().withheld(kind, why), plain_statistics=None)
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.

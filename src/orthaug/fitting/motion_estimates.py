@@ -15,7 +15,14 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.estimates import (
+    STD_KINDS,
+    WITHHELD,
+    AnyFit,
+    Restart,
+    parameter_frame,
+    parameter_lines,
+)
 from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
@@ -339,7 +346,7 @@ def _with_split(
         fit,
         model=model,
         covariance=None
-        if fit.std_kind == "none"
+        if fit.std_kind in WITHHELD
         else enlarge_covariance(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
