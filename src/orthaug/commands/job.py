@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from orthaug import __version__
 from orthaug._base.errors import InputError, Warning, show
@@ -24,6 +24,7 @@ from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
+    from orthaug.analysis.imitation import Imitation
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
     from orthaug.fitting.structures import Structure
@@ -72,7 +73,13 @@ class Variant:
 AS_DECLARED = Variant()
 
 
-class JobPhysics(ABC):
+P = TypeVar("P")
+"""The problem of a kind of physics."""
+F = TypeVar("F")
+"""The fit of a kind of physics."""
+
+
+class JobPhysics(ABC, Generic[P, F]):
     """The parts of a job that depend on its physics."""
 
     section: ClassVar[str]
@@ -86,7 +93,7 @@ class JobPhysics(ABC):
 
     @classmethod
     @abstractmethod
-    def declare(cls, spec: Spec, step: float | None) -> Any:
+    def declare(cls, spec: Spec, step: float | None) -> Self:
         """Return the physics of a spec, checked; `step` is the sampling time, where it is known.
 
         Raises:
@@ -98,12 +105,12 @@ class JobPhysics(ABC):
         """Return the rows before the first one with a prediction, and the fewest of a stretch."""
 
     @abstractmethod
-    def pose(self, spec: Spec, record: Record) -> Any:
+    def pose(self, spec: Spec, record: Record) -> P:
         """Return the problem on a record in memory."""
 
     def pose_part(
         self, spec: Spec, train: Part, kind: str, engine: Engine, *, require_full_rank: bool
-    ) -> tuple[Any, tuple[Warning, ...]]:
+    ) -> tuple[P, tuple[Warning, ...]]:
         """Return the problem on the training data, and warnings on terms that are left out.
 
         Rows that an engine of this kind does not hold in memory remain in their source.
@@ -111,15 +118,15 @@ class JobPhysics(ABC):
         return self.pose(spec, train.record), ()
 
     @abstractmethod
-    def under(self, measure: Measure, spec: Spec, problem: Any) -> Any:
+    def under(self, measure: Measure, spec: Spec, problem: P) -> Self:
         """Return the physics under a measure, with the suspects of the spec, both checked."""
 
-    def check_record(self, problem: Any, record: Record) -> None:
+    def check_record(self, problem: P, record: Record) -> None:
         """Raise InputError where the problem has no value on another record."""
         return None
 
     @abstractmethod
-    def train(self, problem: Any, **options: Any) -> Any:
+    def train(self, problem: P, **options: Any) -> F:
         """Train a problem."""
 
     @property
@@ -128,14 +135,16 @@ class JobPhysics(ABC):
         return ("orthogonal",)
 
     @abstractmethod
-    def fold_training(self, job: Job, variant: Variant) -> tuple[Callable[..., Any], Callable]:
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], P], Callable[..., F]]:
         """Return functions that pose a variant on a fold, and train it."""
 
     def runner(self, engine: Engine) -> Any:
         """Return the runner of independent runs."""
         return Threads()
 
-    def without(self, problem: Any, samples: Any) -> str:
+    def without(self, problem: P, samples: Any) -> str:
         """Return a sentence on the result of a fit without some samples; "" where that is long."""
         return ""
 
@@ -148,31 +157,31 @@ class JobPhysics(ABC):
         """Return the error of parameters that the data do not determine; None where they do."""
 
     @abstractmethod
-    def robust(self, fit: Any, one_step: Response) -> Any:
+    def robust(self, fit: F, one_step: Response) -> F:
         """Return the fit with the standard errors that its residual calls for."""
 
-    def describe(self, fit: Any) -> dict[str, Any]:
+    def describe(self, fit: F) -> dict[str, Any]:
         """Return the section of the result that only this physics has."""
         return {}
 
     @abstractmethod
     def analyse(
-        self, job: Job, fit: Any, one_step: Response, free_run: Response, warnings: list[Any]
+        self, job: Job, fit: F, one_step: Response, free_run: Response, warnings: list[Any]
     ) -> dict[str, Any]:
         """Return the findings on a fit, with the `budget` of its biases; warnings are added."""
 
     @abstractmethod
-    def shared(self, job: Job, fit: Any) -> tuple[Any, list[Warning]]:
+    def shared(self, job: Job, fit: F) -> tuple[Imitation | None, list[Warning]]:
         """Return what the learner could imitate, and warnings on what it nearly could."""
 
     @abstractmethod
     def figures(
-        self, job: Job, fit: Any, responses: Mapping[str, tuple[Response, Response]]
+        self, job: Job, fit: F, responses: Mapping[str, tuple[Response, Response]]
     ) -> dict[str, Figure]:
         """Return the figures that only this physics has."""
 
     @abstractmethod
-    def run_alone(self, fit: Any, record: Record, free_run: Response) -> Response:
+    def run_alone(self, fit: F, record: Record, free_run: Response) -> Response:
         """Return the free run by the model's physics without its learner."""
 
     @abstractmethod
@@ -205,11 +214,11 @@ class JobPhysics(ABC):
         """Return the holds of the inputs between samples that could be tried instead."""
         return ()
 
-    def settled(self, fit: Any) -> dict[str, Any]:
+    def settled(self, fit: F) -> dict[str, Any]:
         """Return the values of a spec that a fit has chosen, as a change of the spec."""
         return {}
 
-    def explained_residual(self, fit: Any) -> Callable[[SuspectResult], tuple[float, float]] | None:
+    def explained_residual(self, fit: F) -> Callable[[SuspectResult], tuple[float, float]] | None:
         """Return a function that gives the share of the residual that a suspect explains.
 
         With its coefficient. None where the table of suspects says so.
@@ -226,7 +235,7 @@ class Job:
     train: Part
     validation: Part | None
     tests: tuple[Part, ...]
-    physics: JobPhysics
+    physics: JobPhysics[Any, Any]
     problem: Any
     measure: Measure
     """The measure that the spec declares."""
@@ -425,7 +434,9 @@ class Job:
         return options
 
 
-def _fit_fold(fold: Record, posed: Callable, train: Callable, options: dict[str, Any]) -> Any:
+def _fit_fold(
+    fold: Record, posed: Callable[[Record], P], train: Callable[..., F], options: dict[str, Any]
+) -> F:
     """Return the fit to a fold; a function of the module, so that it can be sent to a process."""
     return train(posed(fold), **options)
 

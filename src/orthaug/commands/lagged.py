@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -53,7 +53,7 @@ _NOT_ANALYSED = Warning(
 
 
 @dataclass(frozen=True, eq=False)
-class LaggedPhysics(JobPhysics):
+class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
     """A baseline, what its learner sees, and the physical parameters behind θ."""
 
     baseline: Baseline
@@ -68,7 +68,7 @@ class LaggedPhysics(JobPhysics):
     most_trials: ClassVar[int] = 3
 
     @classmethod
-    def declare(cls, spec: Spec, step: float | None) -> LaggedPhysics:
+    def declare(cls, spec: Spec, step: float | None) -> Self:
         baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
         physics = None if step is None else spec.physics_map(step)
         if physics is not None:
@@ -190,7 +190,7 @@ class LaggedPhysics(JobPhysics):
         problem.feature_rows()
         return problem, left_out
 
-    def under(self, measure: Measure, spec: Spec, problem: Problem) -> LaggedPhysics:
+    def under(self, measure: Measure, spec: Spec, problem: Problem) -> Self:
         weighed = weigh_problem(measure, problem)
         if problem.excitation.full_rank and not weighed.excitation.full_rank:
             groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
@@ -207,7 +207,9 @@ class LaggedPhysics(JobPhysics):
     def train(self, problem: Problem, **options: Any) -> Estimate:
         return _train(problem, **options)
 
-    def fold_training(self, job: Job, variant: Variant) -> tuple[Callable[..., Any], Callable]:
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], Problem], Callable[..., Estimate]]:
         """Return functions that pose a variant on a fold, and train it.
 
         They can be sent to another process. A fold is small: its rows are in memory.

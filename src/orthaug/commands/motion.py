@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -44,7 +44,7 @@ _NOT_RICH = Warning(
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPhysics(JobPhysics):
+class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     """Equations of motion, and the terms that they may lack."""
 
     motion: Motion
@@ -55,7 +55,7 @@ class MotionPhysics(JobPhysics):
     most_trials: ClassVar[int] = 2
 
     @classmethod
-    def declare(cls, spec: Spec, step: float | None) -> MotionPhysics:
+    def declare(cls, spec: Spec, step: float | None) -> Self:
         assert spec.motion is not None
         try:
             motion = spec.motion.motion_of(spec.data.inputs, spec.data.outputs)
@@ -130,7 +130,7 @@ class MotionPhysics(JobPhysics):
         inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
         return pose_motion(record, self.motion, inputs, spec.training.output_weights, **options)
 
-    def under(self, measure: Measure, spec: Spec, problem: MotionProblem) -> MotionPhysics:
+    def under(self, measure: Measure, spec: Spec, problem: MotionProblem) -> Self:
         """Return the physics with the suspects of the spec; the measure is tried.
 
         It is tried on the guessed states, so that wrong names and limits are found before training.
@@ -145,7 +145,9 @@ class MotionPhysics(JobPhysics):
 
         return fit_motion(problem, **options)
 
-    def fold_training(self, job: Job, variant: Variant) -> tuple[Callable[..., Any], Callable]:
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], MotionProblem], Callable[..., MotionEstimate]]:
         """Return functions that pose a variant on a fold by the sizes of all rows, and train it."""
         return job.problem.on, self.train
 
