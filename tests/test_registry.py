@@ -110,9 +110,7 @@ def test_a_learner_from_outside(project, tmp_path):
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         model = load(tmp_path / "out")
-        assert model.form.bound is not None and model.form.bound.learner == Powers(
-            2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
-        )
+        assert model.form.bound.learner == Powers(2, (1.0, 2.5), ("u[k-1]", "y[k-1]"))
         assert model.form.bound.size == 2
     with pytest.raises(
         InputError, match="learner is of the kind 'powers', which is not registered here"
@@ -211,7 +209,7 @@ def test_the_kinds_of_a_file_are_the_classes_of_the_library():
 def test_reading_a_spec_loads_no_jax():
     """Declarations are there, and with them every key of the spec, before anything is compiled."""
     program = (
-        "import sys, orthaug.commands.kinds, orthaug.commands.spec as spec\n"
+        "import sys, orthaug.commands.opening, orthaug.commands.spec as spec\n"
         "spec.spec_model()\n"
         "print([name for name in ('jax', 'optax') if name in sys.modules])"
     )

@@ -228,7 +228,7 @@ def _lagged_budget(
     measure: Measure | None,
 ) -> Budget | None:
     """Return `bias_budget` of a fit of difference equations."""
-    if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+    if not fit.status.ok or fit.model.structure != "orthogonal":
         return None
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name
@@ -251,7 +251,9 @@ def budget_on(
     if not terms.names or terms.fit.freedom < _FEWEST_LEFT:
         return None
     if terms.learned is None:
-        found = explain_residual(named if named is not None else bias_table(terms, declared))
+        found = explain_residual(
+            named if named is not None else bias_table(terms, declared, certify=False)
+        )
         return None if found is None else budget_by(terms, [found], declared=declared)
     parts = terms.parts()
     whole = first_causes(terms, declared, named) if parts else None

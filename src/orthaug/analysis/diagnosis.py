@@ -44,7 +44,6 @@ from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import without_learner
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.inference.covariance import by_experiment
@@ -166,8 +165,9 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
     It runs in the same compiled programs.
     """
-    solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
-    posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
+    solver, posed = LevenbergMarquardt().within_limit, fit.problem
+    posed = posed if fit.learns else posed.without_learner()
+    learner = fit.model.form.bound.learner
     return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 

@@ -31,8 +31,8 @@ from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.robustness import block_of
 from orthaug.analysis.suspects import MotionSuspect, check_motion_suspects
+from orthaug.fitting.field_points import field_under
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import reach
@@ -86,7 +86,7 @@ class MotionTerms:
     @property
     def learns(self) -> bool:
         """True if there is a learner."""
-        return self.place.segmented.bound is not None
+        return self.place.segmented.bound.learns
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -373,7 +373,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
     ridge = fit.model.statistics.ridge / fit.scores.unit
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
     place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
-    if fit.model.form.bound is not None:
+    if fit.learns:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
@@ -395,7 +395,7 @@ def linearize_physics(task: MotionTask, structure: Structure) -> MotionTerms | N
         segmented, point.theta, weights, point.states, task.physics.objective.weight
     )
     none = MotionSplit.empty("training", form, point.theta)
-    if segmented.bound is None:
+    if not segmented.bound.learns:
         return MotionTerms(place, point.theta, none.shared, none.field)
     field = field_under(
         structure.measure,

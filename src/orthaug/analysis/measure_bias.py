@@ -247,8 +247,7 @@ def linearization_of(
 ) -> LaggedTerms:
     """Return a fit for biases by terms, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
-    learns = fit.model.form.bound is not None
-    learned = fit.model.learner_at(weighed.points.x) if learns else None
+    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
     return LaggedTerms(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared, fit)
 
 

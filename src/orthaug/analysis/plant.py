@@ -20,6 +20,7 @@ from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.regressors import in_order, largest_lag
 from orthaug.models.dynamics import Numbers
+from orthaug.models.learners import nothing_learned
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.integrators import inputs_at_points
@@ -227,7 +228,7 @@ class MotionPlant:
             [start if isinstance(start, float | int) else 0.0 for start in starts], dtype=float
         )
         suspected = SuspectedMotion.of(motion, [suspect.term(motion) for suspect in suspects])
-        self._form = MotionDynamics(suspected, (), None, sampling_time, substeps)
+        self._form = MotionDynamics(suspected, (), nothing_learned(), sampling_time, substeps)
         self._coefficients = np.array([suspect.coefficient for suspect in suspects], dtype=float)
         coordinates = motion.coordinates
         q = coordinates.of(self.theta)

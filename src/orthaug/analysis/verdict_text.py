@@ -179,11 +179,7 @@ def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete and seen.inconsistent is not None:
         return "The one-step residual is slightly coloured, but enough to move θ.", ()
     if seen.complete:
-        so = (
-            "the intervals hold"
-            if seen.fit.model.form.bound is None
-            else "the tests find only noise"
-        )
+        so = "the intervals hold" if not seen.fit.learns else "the tests find only noise"
         return (
             f"The one-step residual is white: {so}, and no criterion is better than this one.",
             (),
@@ -396,11 +392,7 @@ def free_run_words(
         noise = "is white: noise on the outputs, which the training assumes."
         return f"The free run's error ({sizes}) {noise}{small_effects(tests, shares)}"
     if verdict == "equation_noise":
-        learner = (
-            "that the learner does not see"
-            if fit.model.form.bound is not None
-            else "(a learner would show which)"
-        )
+        learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
         no_input = "no input, " if fit.problem.motion.inputs else ""
         colour = describe_colour(tests, shares)
         return (

@@ -65,20 +65,22 @@ def check(
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
     from orthaug.commands.folder import check_figure, save_figure
-    from orthaug.commands.kinds import kind_of, open_job
+    from orthaug.commands.job_result import check as check_job
+    from orthaug.commands.job_result import refusal
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
-    if job.spec.motion is not None:  # its runs are computed
+    if job.physics.runs_in_check:
         prepare_jax()
-    result = kind_of(job).check(job)
+    result = check_job(job)
     print_result(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
-    refused = kind_of(job).refusal(job, result)
+    refused = refusal(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 
@@ -96,7 +98,7 @@ def fit(
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, keep_states, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -106,7 +108,7 @@ def fit(
     prepare_jax()
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
-    learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
+    learns, rows = job.spec.declared_learner() is not None, job.problem.count
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
     if other_writes():
@@ -135,7 +137,7 @@ def compare(
 ) -> None:
     """Compare physics alone and every structure in one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -170,7 +172,7 @@ def design(
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.result import DesignResult
     from orthaug.reports.text import design_text
 
@@ -225,6 +227,14 @@ def init(
     sampling_time: Annotated[
         float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")
     ] = None,
+    system: Annotated[
+        str | None,
+        typer.Option(
+            "--system",
+            metavar="KIND[,KEY=VALUE]",
+            help="Physics instead of linear lags: hammerstein_wiener,order=3.",
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Look at a data file, and write a first spec that runs.
@@ -234,9 +244,11 @@ def init(
     from orthaug._base.errors import InputError
     from orthaug.commands.folder import check_file
     from orthaug.commands.init import assign, draft, look, question, write_spec
+    from orthaug.commands.written_motion import system_of
     from orthaug.data.record import check_step
 
     check_file(out, data, force=force)
+    declared = None if system is None else system_of(system)
     if sampling_time is not None:
         check_step(sampling_time)
     large = data.is_file() and data.stat().st_size > _LARGE
@@ -267,7 +279,7 @@ def init(
         )
     assert roles is not None  # both are given
     report_stage("looking at signals, delays and orders")
-    spec = draft(found, roles, out)
+    spec = draft(found, roles, out, declared)
     report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")

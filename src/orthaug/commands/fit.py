@@ -15,12 +15,12 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
+from orthaug.commands import job_result
 from orthaug.commands.attempt import attempt
 from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.doubts import with_doubts
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import AS_DECLARED, DEFAULT_BLOCKS, PHYSICS_ONLY, Job, Variant, origin_of
-from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.commands.scales import describe_scales
 from orthaug.inference.learned_terms import equation, learned_terms
@@ -99,7 +99,8 @@ def with_advice(fitted: FitReport) -> FitReport:
 def with_verdict(fitted: FitReport) -> FitReport:
     """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
-    if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
+    learns = fit.learns
+    if not fit.status.ok or not (learns or fit.held_out is not None):
         return fitted
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
@@ -111,13 +112,13 @@ def with_verdict(fitted: FitReport) -> FitReport:
         None,
     )
     warnings += failed
-    asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
+    asked = learns and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
         why = "training was stopped too early for cross-validation" if _was_stopped(fit) else short
         text = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=text))
-    if verdict is not None and fit.model.form.bound is not None:
+    if verdict is not None and learns:
         text = (
             *verdict.warnings,
             *_unexplained_warnings(fitted, None if verdict.code == "helps" else physics),
@@ -235,15 +236,11 @@ def report_of(job: Job, fit: Any) -> FitReport:
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
-    if (
-        fit.status.ok
-        and job.spec.training.chosen_focus() == "prediction"
-        and fit.model.form.bound is not None
-    ):
+    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.learns:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )
-    fit, fields = kind_of(job).content(job, fit, responses, warnings)
+    fit, fields = job_result.content(job, fit, responses, warnings)
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
     content = fields | {
@@ -293,7 +290,7 @@ def _over_experiments(job: Job, fit: Any, warnings: list[Any]) -> dict[str, Any]
     found = fit.over_experiments
     if found is None:
         return None
-    names = [parameter.name for parameter in fit.declared]
+    names = fit.problem.names
     doubt = differing_warning(found, names, fit.values)
     warnings.extend([] if doubt is None else [doubt])
 
@@ -307,7 +304,7 @@ def _over_experiments(job: Job, fit: Any, warnings: list[Any]) -> dict[str, Any]
         "experiments": found.experiments,
         "parameters": rows(names, found.std, found.interval, found.ratio),
     }
-    physics = getattr(job, "physics", None)
+    physics = job.physics.map
     if physics is not None:
         own = fit.physical(physics)
         over = replace(fit, covariance=found.covariance, freedom=found.freedom).physical(physics)
@@ -399,7 +396,7 @@ def judge_fit(
     job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
     held_out = job.parts[1:]
     simulated = fitted.fit.criterion.simulates
-    if chosen_by is not None and model.form.bound is None:
+    if chosen_by is not None and not model.learns:
         return judge(trials_of(chosen_by)) if simulated else None
     if blocks is None:
         wanted = wanted_blocks(job)
@@ -427,7 +424,10 @@ def judge_fit(
             )
         )
         beyond += extrapolation(
-            part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record)
+            part.name,
+            fitted.fit.reach(part.record),
+            fitted.fit.reach(job.train.record),
+            fitted.fit.layout,
         )
     return judge(trials, beyond)
 
@@ -541,11 +541,7 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     physics = fitted.fit.physics_alone
-    if (
-        physics is None
-        and fitted.fit.model.form.bound is None
-        and fitted.job.spec.declared_learner() is not None
-    ):
+    if physics is None and not fitted.fit.learns and fitted.job.spec.declared_learner() is not None:
         physics = fitted.fit  # the learner was left out
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
@@ -558,7 +554,7 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
 def _draw(fitted: FitReport, folder: Path) -> None:
     from orthaug.reports import plots
 
-    drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
+    drawn = job_result.figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
     for name, figure in drawn.items():
         plots.save(figure, folder / f"{name}.png")
 
@@ -573,7 +569,7 @@ def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     from orthaug.reports.page_fit import FitPage
 
     job, fit, responses = fitted.job, fitted.fit, fitted.responses
-    alone = {} if fit.model.form.bound is None else kind_of(job).physics_alone(job, fit, responses)
+    alone = job_result.physics_alone(job, fit, responses) if fit.learns else {}
     learned = learned_of(fit, job.train.record)
     return fit_page(
         FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned)

@@ -15,9 +15,16 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.estimates import (
+    STD_KINDS,
+    WITHHELD,
+    AnyFit,
+    Restart,
+    parameter_frame,
+    parameter_lines,
+)
+from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
-from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines
@@ -39,8 +46,8 @@ from orthaug.models.motion_field import parts_at
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
-from orthaug.physics.motion_problem import MotionProblem, layout_of
-from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.excitation import Excitation, of_gram
+from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections
 
@@ -101,17 +108,22 @@ class MotionEstimate(AnyFit):
     """The estimate of physics alone that the learner had to beat; None without a learner."""
     warnings: tuple[Warning, ...] = ()
 
-    lagged: ClassVar[bool] = False
+    one_step_theta: ClassVar[None] = None
+    """A motion has no least squares one step ahead."""
 
     @property
-    def declared(self) -> tuple[PhysicalParameter, ...]:
-        """The declared parameters, in the order of p̂."""
-        return self.problem.motion.parameters
+    def excitation(self) -> Excitation:
+        """Rank and condition of the parameters in the outputs of the fitted motion."""
+        names, gram = self.problem.names, self.model.statistics.gram
+        count = len(names)
+        if gram is None:
+            return Excitation(0, count, None, ())
+        return of_gram(gram[:count, :count], names)
 
     @property
     def layout(self) -> Layout:
         """Names of the entries of `reach`."""
-        return layout_of(self.problem.motion)
+        return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
         """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
@@ -237,7 +249,7 @@ class MotionEstimate(AnyFit):
         free_run = self.criterion.free_run
         assert free_run is not None, "a motion is trained on its free run"
         changes = self._changes_of_free_run(free_run)
-        if changes is None or self.model.form.bound is None:
+        if changes is None or not self.learns:
             return changes
         owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):
@@ -275,12 +287,16 @@ class MotionEstimate(AnyFit):
     def lines(self) -> list[str]:
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
         seen = ", ".join(str(entry) for entry in form.features)
-        learner = "none"
-        if bound is not None:
+        learner, split = str(bound), []
+        if self.learns:
             learner = (
                 f"{bound.learner} of {seen}, {bound.size} weights, "
                 f"{self.effective_weights:.1f} effective"
             )
+            split = [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
         lines = [
             f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
@@ -288,12 +304,8 @@ class MotionEstimate(AnyFit):
             f"learner     {learner}",
             f"data        {self.problem.record!r}",
             *self.status.lines,
+            *split,
         ]
-        if bound is not None:
-            lines += [
-                f"shared      {shared_in_words(self.shared)}",
-                f"measure     {self.split_by.name}",
-            ]
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
@@ -322,7 +334,7 @@ def _with_split(
     warnings = [
         *of_measure,
         *_ill_conditioned(fit, split),
-        *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
+        *_doubts(split, at_bound, unseen, fit.learns),
     ]
     model = replace(
         fit.model,
@@ -334,7 +346,7 @@ def _with_split(
         fit,
         model=model,
         covariance=None
-        if fit.std_kind == "none"
+        if fit.std_kind in WITHHELD
         else enlarge_covariance(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,
