@@ -10,14 +10,14 @@ from __future__ import annotations
 import sys
 import time
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from machine import describe
 
 import orthaug as oa
 from orthaug.analysis.budget import budget_by
-from orthaug.analysis.causes import Considered, explain_learner
+from orthaug.analysis.causes import AS_CLOSE, CLOSE, Considered, explain_learner
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.learned_part import learned_reach
 from orthaug.models.motion_field import parts_at
@@ -124,7 +124,8 @@ def damper_alone(fit: oa.MotionEstimate) -> tuple[float, float, float]:
     """Whether the usual terms tell of dry friction, where none was declared, and the interval that counts it."""
     terms = linearize_fit(fit)
     assert terms is not None
-    considered = Considered(*terms.usual_biases(), joint=True, seen_only=True)
+    options: dict[str, Any] = {"close": (AS_CLOSE, CLOSE), "joint": True, "seen_only": True}
+    considered = Considered(*terms.usual_biases(), **options)
     causes = explain_learner(terms, considered)
     budget = None if causes is None else budget_by(terms, [causes])
     found = None if budget is None else budget.of("c")

@@ -14,7 +14,14 @@ from orthaug import InputError
 from orthaug.analysis.bias import bias_table, table_beside
 from orthaug.analysis.budget import budget_by, budget_on
 from orthaug.analysis.catalogue import Catalogue
-from orthaug.analysis.causes import Considered, explain_learner, one_of_each, rivals_of
+from orthaug.analysis.causes import (
+    AS_CLOSE,
+    CLOSE,
+    Considered,
+    explain_learner,
+    one_of_each,
+    rivals_of,
+)
 from orthaug.analysis.free_run_bias import linearize_fit
 
 FRICTION = oa.MotionSuspect.of(
@@ -32,7 +39,8 @@ def motion_budget(fit, table, smooth=()):
     terms, declared = linearize_fit(fit), [entry.suspect for entry in table]
     if terms.learned is None:
         return budget_on(terms, declared, table)
-    considered = Considered(table, smooth, joint=True, seen_only=True)
+    close = (AS_CLOSE, CLOSE)
+    considered = Considered(table, smooth, close=close, joint=True, seen_only=True)
     causes = explain_learner(terms, considered, declared)
     return None if causes is None else budget_by(terms, [causes], declared=declared)
 

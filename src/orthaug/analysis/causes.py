@@ -1,8 +1,8 @@
 """Causes that explain a learner: one term, or one of each learned equation, and what they leave.
 
 Of all terms that are considered the one is named that explains most of ‖P⊥F‖², F the learner under
-the measure; a member of a family (`catalogue`), whose width is fitted too, only where it leaves
-clearly less. Where one term is not sure to be all of it, one term of each learned equation may
+the measure; a member of a family (`catalogue`), whose width is fitted too, only where it explains
+clearly more. Where one term is not sure to be all of it, one term of each learned equation may
 explain it together. The same choice serves difference equations and motions: `Considered` says what
 is different, and why.
 """
@@ -27,6 +27,7 @@ ELSEWHERE = 0.5  # of a bias, from which that of a rival is another one
 _NEAR = 0.5  # of what the cause explains: a term that is listed beside it
 _MOST_NEAR = 3
 _SURE_T = 3.3  # standard errors of a coefficient: one in a thousand is so large by chance
+_ROUNDING = 1e-9  # of a share
 _SAME = 1e-6  # of a term's squares: what others leave of it is none
 MOST_POINTS = 20_000  # over which terms of each equation are chosen
 
@@ -37,15 +38,20 @@ class Considered:
 
     plain: Sequence[SuspectedBias]
     soft: Sequence[SuspectedBias] = ()
-    """Smooth forms of plain ones that jump, named where they leave clearly less."""
+    """Smooth forms of plain ones that jump, named where they explain clearly more."""
     families: Sequence[SuspectedBias] = ()
-    """Members of families, named where they leave clearly less."""
+    """Members of families, named where they explain clearly more."""
     beside: Sequence[SuspectedBias] | None = None
     """Terms that may explain what a cause leaves; None for plain and soft ones."""
     alike: Sequence[SuspectedBias] = ()
     """Terms that no one names, but that explain the same with another bias."""
     enough: float = LEAST_SHARE
     """Share from which on a cause among them is named."""
+    close: tuple[float, float] = (1.0, 0.0)
+    """What a plain term may leave and still be as good as one of a family: times what that leaves,
+    and share of the learner. The learner of a motion is trained through its free run, which blurs
+    it: there a form is better only by more than that.
+    """
     joint: bool = False
     """Whether terms of several equations explain the learner together. A term of a motion, such as
     a force between two masses, acts in several equations and moves parameters that they share;
@@ -129,17 +135,15 @@ def explain_learner(
 
 
 def best_of(considered: Considered) -> SuspectedBias | None:
-    """Return the plain term that explains most, or one of a family that leaves clearly less."""
+    """Return the plain term that explains most, or one of a family that explains clearly more."""
     best = max(considered.plain, key=_share, default=None)
     other = max((*considered.soft, *considered.families), key=_share, default=None)
-    if other is not None and (best is None or _is_clearly_less(best.share, other.share)):
-        return other
-    return best
-
-
-def _is_clearly_less(share: float, other: float) -> bool:
-    """Return whether a plain term gives way to a member of a family, which also fits a width."""
-    return share < AS_MUCH * other and 1 - share > max(AS_CLOSE * (1 - other), CLOSE)
+    if best is None or other is None:
+        return best or other
+    # A plain term gives way only where it explains clearly less: a family also fits a width
+    times, least = considered.close
+    less = best.share < AS_MUCH * other.share
+    return other if less and 1 - best.share > max(times * (1 - other.share), least) else best
 
 
 def _share(entry: SuspectedBias) -> float:
@@ -254,7 +258,12 @@ def _weigh_causes(
     if considered.can_compare(causes):
         rest = [entry for entry in considered.every if considered.can_compare([entry])]
         beside = [entry for entry in table_beside(terms, causes, rest) if entry.explained]
-    unsure += [max(beside, key=_share).shift] if beside else []
+    if beside:
+        # A dead zone and a saturation whose sum is physics explain the same: rounding must not
+        # choose between their biases
+        most = (1 - _ROUNDING) * max(map(_share, beside))
+        equal = [np.abs(entry.shift) for entry in beside if entry.share >= most]
+        unsure.append(np.max(equal, axis=0))
     near = near_causes(causes[0], considered.every, declared) if len(causes) == 1 else ()
     comparable = (*considered.comparable,) if len(causes) == 1 else ()
     return Causes(causes, share, bias, np.array(unsure), (*rivals,), near, comparable, terms)

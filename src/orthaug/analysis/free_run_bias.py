@@ -26,7 +26,7 @@ from orthaug.analysis.bias import (
 )
 from orthaug.analysis.bias_hull import MOST_PHYSICS
 from orthaug.analysis.catalogue import Catalogue, soften_jumps
-from orthaug.analysis.causes import MOST_POINTS, SURE_SHARE, Considered
+from orthaug.analysis.causes import AS_CLOSE, CLOSE, MOST_POINTS, SURE_SHARE, Considered
 from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.robustness import block_of
@@ -216,7 +216,9 @@ class MotionTerms:
         if named is None:
             named = bias_table(self, declared)
         soft, families = self.softened(declared), self.families()
-        options: dict[str, Any] = {"families": families, "joint": True, "seen_only": True}
+        close = (AS_CLOSE, CLOSE)
+        options: dict[str, Any] = {"close": close, "joint": True, "seen_only": True}
+        options["families"] = families
         if named:
             yield Considered(named, soft, enough=SURE_SHARE, **options)
         usual, softer = self.usual_biases()
