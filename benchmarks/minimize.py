@@ -17,7 +17,7 @@ from minimize_problems import DIGITS, Problem, more, nist
 
 from orthaug import LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
-from orthaug.fitting.solvers.descent import MARQUARDT
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 
 MOST = 2000  # steps, or evaluations
 TINY = 1e-15

@@ -12,8 +12,9 @@ import scipy.optimize
 import scipy.signal
 
 from orthaug.fitting.colour import independent_share
-from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.limit import Limit
+from orthaug.fitting.solvers.minimize import SquaredResiduals, minimize
 
 
 @dataclass
@@ -75,7 +76,7 @@ def run(objective, p, *, physics=None, iterations=200, **options):
         "damping": MARQUARDT,
     } | options
     objective.physics = len(p) if physics is None else physics
-    end = descend(objective, np.array(p, dtype=float), None, **options)
+    end = minimize(objective, np.array(p, dtype=float), None, **options)
     hessian = None if end.linear is None else end.linear.hessian
     return Outcome(
         end.point.p,
