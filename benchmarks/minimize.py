@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,9 @@ from minimize_problems import DIGITS, Problem, more, nist
 
 from orthaug import LevenbergMarquardt
 from orthaug._base.jax import jax, jnp
+from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers.damped_step import MARQUARDT
+from orthaug.models.rows import Overlap
 
 MOST = 2000  # steps, or evaluations
 TINY = 1e-15
@@ -63,11 +66,32 @@ class LeastSquares:
         return float(len(self.problem.residual(point.p))), 1.0
 
 
-def by_orthaug(problem: Problem) -> Outcome:
+def by_orthaug(problem: Problem, most: int = MOST) -> Outcome:
     """Solve with the damping of the free run, driven by the host."""
-    solver = LevenbergMarquardt(MOST, 1e-14, MOST)
+    solver = LevenbergMarquardt(most, 1e-14, most)
     end = solver.descend(LeastSquares(problem), np.array(problem.start), None, damping=MARQUARDT)
     return Outcome(end.point.p, problem.digits(end.point.p), end.iterations + 1)
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """A problem as the criterion of the compiled loop, beside no physics."""
+
+    residuals: Callable[[Any], Any]
+
+    def __call__(self, p: Any, overlap: Overlap) -> Normal:
+        residual, jacobian = self.residuals(p), jax.jacfwd(self.residuals)(p)
+        return Normal(jacobian.T @ jacobian, -jacobian.T @ residual, residual @ residual, overlap)
+
+
+def by_compiled(problem: Problem, most: int = MOST) -> Outcome:
+    """Solve with the same damping, compiled whole."""
+    n, solver = len(problem.start), LevenbergMarquardt(most, 1e-14, most)
+    nothing = Overlap(jnp.zeros((0, n)), jnp.zeros(0))
+    criterion, p = Criterion(problem.residuals), jnp.asarray(problem.start)
+    end = solver.minimize(criterion, p, (), nothing, samples=n, damping=MARQUARDT)
+    p = np.asarray(end.w)
+    return Outcome(p, problem.digits(p), end.iterations + 1)
 
 
 def by_scipy(problem: Problem, method: str) -> Outcome:
@@ -101,7 +125,8 @@ def by_optimistix(problem: Problem) -> Outcome:
 
 
 SOLVERS: dict[str, Callable[[Problem], Outcome]] = {
-    "orthaug": by_orthaug,
+    "orthaug, driven by the host": by_orthaug,
+    "orthaug, compiled": by_compiled,
     "SciPy, lm (MINPACK)": lambda problem: by_scipy(problem, "lm"),
     "SciPy, trf": lambda problem: by_scipy(problem, "trf"),
 }
