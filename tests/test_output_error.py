@@ -407,3 +407,10 @@ def test_stretches_are_never_mixed():
 )
 def test_residuals_that_say_nothing_count_as_independent(residuals):
     assert independent_share(residuals) == 1.0
+
+
+def test_a_weight_that_does_nothing_is_not_effective():
+    matrix, right, _ = linear(columns=3)
+    matrix = matrix * [1.0, 1.0, 0.0]
+    end = run(LeastSquares(lambda p: matrix @ p - right, lambda p: matrix), np.zeros(3), physics=1)
+    assert end.effective == pytest.approx(1.0) and end.code == "converged" and end.p[2] == 0.0

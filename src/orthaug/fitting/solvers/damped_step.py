@@ -161,7 +161,8 @@ def level_entries(hessian: Any, downhill: Any, objective: Any, xp: Any) -> Any:
 def effective_weights(hessian: Any, ridge: Any, floor: Any, xp: Any) -> Any:
     """Return γ = tr(H (H + αI)⁻¹). Directions of a curvature up to `floor` count as absent."""
     values = xp.linalg.eigvalsh(xp.where(xp.isfinite(hessian), hessian, 0.0))
-    return xp.sum(xp.where(values > floor, values / (values + ridge), 0.0))
+    seen = values > floor
+    return xp.sum(xp.where(seen, values, 0.0) / xp.where(seen, values + ridge, 1.0))
 
 
 def effective_of_each(hessian: Any, ridge: Any, xp: Any) -> Any:
