@@ -262,6 +262,14 @@ def report_of(job: Job, fit: Any) -> FitReport:
         "intervals": intervals,
         "warnings": warnings,
     }
+    if fit.status.ok:
+        over = attempt(
+            "the errors over experiments",
+            lambda: _over_experiments(job, fit, warnings),
+            warnings,
+            None,
+        )
+        content |= {"over_experiments": over} if over else {}
     terms = learned_terms(fit.model) if fit.status.ok else ()
     if terms:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
@@ -273,6 +281,39 @@ def report_of(job: Job, fit: Any) -> FitReport:
         responses,
         {name: both for name, (_, both) in ran.items()},
     )
+
+
+def _over_experiments(job: Job, fit: Any, warnings: list[Any]) -> dict[str, Any] | None:
+    """Return intervals for experiments like those fitted; None where these are too few.
+
+    A warning is added where they differ by more than the fit's own intervals allow.
+    """
+    from orthaug.inference.over_experiments import differing_warning
+
+    found = fit.over_experiments
+    if found is None:
+        return None
+    names = [parameter.name for parameter in fit.declared]
+    doubt = differing_warning(found, names, fit.values)
+    warnings.extend([] if doubt is None else [doubt])
+
+    def rows(names: Sequence[str], std: Any, ci95: Any, ratio: Any) -> list[dict[str, Any]]:
+        keys = ("name", "std", "ci95", "ratio")
+        return [
+            dict(zip(keys, row, strict=True)) for row in zip(names, std, ci95, ratio, strict=True)
+        ]
+
+    content = {
+        "experiments": found.experiments,
+        "parameters": rows(names, found.std, found.interval, found.ratio),
+    }
+    physics = getattr(job, "physics", None)
+    if physics is not None:
+        own = fit.physical(physics)
+        over = replace(fit, covariance=found.covariance, freedom=found.freedom).physical(physics)
+        ratio = np.array(over.std, dtype=float) / np.array(own.std, dtype=float)
+        content["physical_parameters"] = rows(over.names, over.std, over.ci95, ratio)
+    return content
 
 
 def _status(fit: Any, warnings: Sequence[Any]) -> Any:

@@ -346,6 +346,23 @@ class Record(NotebookView):
         )
 
     @property
+    def recordings(self) -> tuple[int, ...]:
+        """Number of the recording that each experiment is a stretch of, from 0.
+
+        Missing samples cut a recording into several experiments.
+        """
+        found: list[int] = []
+        for i, one in enumerate(self.experiments):
+            before = self.experiments[i - 1] if i else None
+            goes_on = (
+                before is not None
+                and before.source == one.source
+                and 0 <= before.offset < one.offset
+            )
+            found.append((found[-1] if goes_on else found[-1] + 1) if found else 0)
+        return tuple(found)
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """Outputs first, then inputs: the order of the regressor."""
         return self.outputs + self.inputs

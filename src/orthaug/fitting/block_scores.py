@@ -27,9 +27,10 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
+from orthaug.data.record import Record
 from orthaug.fitting.colour import autoregression, correlation_length
 from orthaug.fitting.objective import errors_of
-from orthaug.fitting.segments import Segments, block_scores, respond
+from orthaug.fitting.segments import Segments, begins_of, block_scores, respond
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.statistics import Statistics
 
@@ -102,6 +103,27 @@ class FreeRunScores:
             [scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1
         )
         return scores[counts > 0]
+
+    def by_recording(self, record: Record, washout: int) -> Float[np.ndarray, "E n"] | None:
+        """Return the score of every recording, in the units of the model's Gram matrix.
+
+        None where the segments are not those of the record's experiments.
+
+        Args:
+            washout: leading steps of a segment that are not scored.
+        """
+        segments = self.blocks(self.longest)
+        steps = self.segments.steps
+        rows = [len(experiment) - self.dynamics.first_row for experiment in record.experiments]
+        counts = [len(begins_of(count, steps, min(washout, steps - 1))) for count in rows]
+        if sum(counts) != len(segments):
+            counts = [1] * len(rows)  # whole experiments, or the first rows of each
+        if sum(counts) != len(segments):
+            return None
+        owner = np.repeat(record.recordings, counts)
+        found = np.zeros((owner[-1] + 1, segments.shape[1]))
+        np.add.at(found, owner, segments)
+        return self.share * self.unit * found
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
         """Return the sensitivities of p on every scored step, the starts eliminated.

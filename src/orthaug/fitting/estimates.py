@@ -16,7 +16,7 @@ from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.fitting.criteria import Criterion, Prediction, Simulation
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import (
@@ -24,11 +24,25 @@ from orthaug.inference.covariance import (
     joint_covariance,
     robust_covariance,
     robust_split_covariance,
+    row_influence,
 )
-from orthaug.inference.influence import hc3, one_step_slopes
+from orthaug.inference.influence import hc3, one_step_slopes, prior_of
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
-from orthaug.inference.measures import Measure, Points, Support, Training
+from orthaug.inference.measures import (
+    OF_ROWS,
+    Measure,
+    Points,
+    Support,
+    Training,
+    weigh_problem,
+)
 from orthaug.inference.nearly_shared import enlarge_covariance
+from orthaug.inference.over_experiments import (
+    FEWEST,
+    OverExperiments,
+    over_experiments,
+    split_without_each,
+)
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import (
     MeasureSplit,
@@ -37,9 +51,10 @@ from orthaug.inference.splitting import (
     streamed_slope,
 )
 from orthaug.models.model import Model
-from orthaug.models.statistics import Statistics
-from orthaug.physics.baseline import check_sampling_constant
+from orthaug.models.statistics import Statistics, half_inverse
+from orthaug.physics.baseline import Parameter, check_sampling_constant
 from orthaug.physics.excitation import Excitation
+from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
@@ -89,6 +104,10 @@ class AnyFit(FitView):
     """Methods common to fits of lagged models and of motions."""
 
     model: Any
+    problem: Any
+    covariance: Matrix | None
+    freedom: float
+    scores: FreeRunScores | None
     warnings: tuple[Warning, ...]
 
     @property
@@ -113,6 +132,47 @@ class AnyFit(FitView):
             InputError: another learner, physics that are Python functions, another writing.
         """
         return equation(self.model, writing)
+
+    @cached_property
+    def over_experiments(self) -> OverExperiments | None:
+        """Errors of θ̂ for experiments like those fitted, by leaving out one after the other.
+
+        Those of `std` and `interval` hold for the inputs that were applied. None where there are
+        fewer than three experiments, or no standard errors.
+        """
+        if self.covariance is None or self.model.numbers.tilt is not None:
+            return None
+        if self.problem.record.recordings[-1] + 1 < FEWEST:
+            return None
+        changes = self._changes_without_each()
+        return None if changes is None else self._over_experiments(changes)
+
+    def _changes_without_each(self) -> Matrix | None:
+        """Return the changes of θ̂ (E, nθ) where each experiment is left out, to first order."""
+        raise NotImplementedError
+
+    def _over_experiments(self, changes: Matrix) -> OverExperiments:
+        return over_experiments(changes, np.asarray(self.covariance), self.freedom, self.theta)
+
+    def moves_by(self) -> tuple[Matrix, Vector] | None:
+        """Return the derivative of θ by (c, w), and which entries of these move."""
+        raise NotImplementedError
+
+    def _changes_of_free_run(self, free_run: Simulation) -> Matrix | None:
+        """Return what leaving an experiment out of the training on the free run changes (E, nθ).
+
+        The points of the split stay.
+        """
+        statistics, moves = self.model.statistics, self.moves_by()
+        if self.scores is None or statistics.gram is None or moves is None:
+            return None
+        scores = self.scores.by_recording(self.problem.record, free_run.washout)
+        if scores is None:
+            return None
+        k, free = moves
+        information = statistics.gram + np.diag(prior_of(statistics, len(self.theta)))
+        half = half_inverse(information[np.ix_(free, free)], int(free[: len(self.theta)].sum()))
+        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * _left_out(len(scores))
 
     def lines(self) -> list[str]:
         """Return the lines of `summary` before its warnings."""
@@ -170,6 +230,16 @@ class Estimate(AnyFit):
 
     lagged: ClassVar[bool] = True
     """Whether the model predicts from lagged signals, so that it has a residual one step ahead."""
+
+    @property
+    def declared(self) -> tuple[Parameter, ...]:
+        """The declared parameters, in the order of θ."""
+        return self.problem.baseline.parameters
+
+    @property
+    def values(self) -> Vector:
+        """The parameters' values: θ̂ (nθ,)."""
+        return self.theta
 
     @property
     def layout(self) -> Layout:
@@ -430,6 +500,47 @@ class Estimate(AnyFit):
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
         return learner_slope(self.model, points, problem.projection, unit)
 
+    def _changes_without_each(self) -> Matrix | None:
+        problem, split = self.problem, self.measure
+        if self.at_bound or isinstance(problem, StreamedProblem):
+            return None
+        recordings = problem.record.recordings
+        experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
+        whole = split is None and self.model.shared is None
+        if self.criterion.one_step and (whole or self.model.form.bound is None):
+            return split_without_each(
+                problem.projection, None, problem.unexplained, owner, experiments
+            )
+        free_run = self.criterion.free_run
+        changes = (
+            self._changes_of_rows(owner, experiments)
+            if free_run is None
+            else self._changes_of_free_run(free_run)
+        )
+        measure = Training() if split is None or split.measure is None else split.measure
+        if changes is None or not isinstance(measure, OF_ROWS) or self.model.form.bound is None:
+            return changes
+        weighed = weigh_problem(measure, problem)
+        values = times(weighed.unit, self.model.learner_at(weighed.points.x))
+        every = np.tile(owner, len(values) // len(owner))
+        found = split_without_each(
+            weighed.projection, self.model.shared, values, every, experiments
+        )
+        return None if found is None else changes + found
+
+    def _changes_of_rows(self, owner: Vector, experiments: int) -> Matrix | None:
+        """Return what leaving an experiment out of the training one step ahead changes (E, nθ)."""
+        if self.model.statistics.gram is None:
+            return None
+        problem = self.problem
+        trajectories = self.model.predict(problem.record).trajectories
+        errors = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        matrix = problem.weight.matrix
+        influence = row_influence(problem, self.model, self._slope())
+        rows = np.einsum("kto,ko->kt", influence, errors @ (matrix.T @ matrix))
+        found = np.stack([rows[owner == e].sum(axis=0) for e in range(experiments)])
+        return -found * _left_out(experiments)
+
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """Return the physical parameters of θ̂, with intervals by the delta method."""
         order, covariance = self._in_order_of(physics)
@@ -493,6 +604,11 @@ class Estimate(AnyFit):
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
+
+
+def _left_out(experiments: int) -> float:
+    """Return by how much more θ̂ changes where an experiment is left out than by its own score."""
+    return experiments / (experiments - 1)
 
 
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:

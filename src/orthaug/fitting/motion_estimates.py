@@ -21,14 +21,27 @@ from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines
-from orthaug.inference.measures import Measure, Training
-from orthaug.inference.motion_split import MotionSplit, split_motion
+from orthaug.inference.measures import OF_ROWS, Measure, Training
+from orthaug.inference.motion_split import (
+    MotionSplit,
+    learned_places,
+    slopes_at,
+    split_motion,
+)
 from orthaug.inference.nearly_shared import enlarge_covariance
+from orthaug.inference.over_experiments import (
+    OverExperiments,
+    over_experiments,
+    split_without_each,
+)
 from orthaug.models.dynamics import Numbers
+from orthaug.models.motion_field import parts_at
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
 from orthaug.physics.motion_problem import MotionProblem, layout_of
+from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections
 
 if TYPE_CHECKING:
@@ -89,6 +102,11 @@ class MotionEstimate(AnyFit):
     warnings: tuple[Warning, ...] = ()
 
     lagged: ClassVar[bool] = False
+
+    @property
+    def declared(self) -> tuple[PhysicalParameter, ...]:
+        """The declared parameters, in the order of p̂."""
+        return self.problem.motion.parameters
 
     @property
     def layout(self) -> Layout:
@@ -171,7 +189,8 @@ class MotionEstimate(AnyFit):
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
-        return _with_split(self, replace(split, support=support), of_measure)
+        split = replace(split, support=support, of_rows=isinstance(measure, OF_ROWS))
+        return _with_split(self, split, of_measure)
 
     def robust(self, steps: int | None = None, kind: str = "batch-means") -> MotionEstimate:
         """Return the fit with standard errors that hold for coloured errors.
@@ -213,6 +232,39 @@ class MotionEstimate(AnyFit):
         return (
             None if made is None or self.split_by.slope is None else (self.split_by.slope, made[1])
         )
+
+    def _changes_without_each(self) -> Matrix | None:
+        free_run = self.criterion.free_run
+        assert free_run is not None, "a motion is trained on its free run"
+        changes = self._changes_of_free_run(free_run)
+        if changes is None or self.model.form.bound is None:
+            return changes
+        owner, field = self.segmented.recording_of_points(), self.split_by.field
+        if not self.split_by.of_rows or len(field.x) % len(owner):
+            return changes
+        basis, motion = self.shared.basis, self.problem.motion
+        slopes = np.asarray(
+            slopes_at(self.segmented.dynamics.physics_only, self.theta, field.x, field.u)
+        )[:, learned_places(motion)]
+        unit = np.sqrt(field.weight)[:, None] / field.size
+        values = parts_at(self.model.form, self.model.numbers, field.x, field.u)[1]
+        every = np.tile(owner, len(field.x) // len(owner))
+        found = split_without_each(
+            Projection.factor(slopes * unit[..., None]), basis, values * unit, every, len(changes)
+        )
+        return None if found is None else changes + found
+
+    def _over_experiments(self, changes: Matrix) -> OverExperiments:
+        coordinates = self.problem.motion.coordinates
+        found = over_experiments(
+            changes,
+            np.asarray(self.covariance),
+            self.freedom,
+            self.theta,
+            coordinates.slopes(self.theta),
+        )
+        ends = [coordinates.physical(side) for side in found.interval.T]
+        return replace(found, interval=np.stack(ends, axis=-1))
 
     def __repr__(self) -> str:
         values = ", ".join(

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax
@@ -215,6 +215,15 @@ class SegmentedMotion(SegmentedProblem):
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
+
+    def recording_of_points(self) -> Int[np.ndarray, "N"]:
+        """Return the number of the recording of each point of `trajectory`."""
+        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
+        scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
+        counts = scored.reshape(-1, steps).sum(axis=1)
+        pieces = [len(begins_of(len(e), steps, washout)) for e in self.record.experiments]
+        segments = np.repeat(self.record.recordings, pieces)
+        return np.repeat(segments, counts[: len(segments)])
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
         """Return the states (N, nx) of every experiment, joined from the segments' runs."""

@@ -320,7 +320,22 @@ def robust_split_covariance(
     Args:
         slope: ∂θ_aux/∂w (nθ, nw).
     """
-    statistics, nt, ny = model.statistics, len(slope), residual.shape[1]
+    influence = row_influence(problem, model, slope)
+    matrix = problem.weight.matrix
+    scores = np.einsum("kro,ko->kr", influence, residual @ (matrix.T @ matrix))
+    return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
+
+
+def row_influence(problem: Problem, model: Model, slope: Matrix) -> Float[np.ndarray, "N nt ny"]:
+    """Return `[I, ∂θ_aux/∂w] M⁻¹ ψ_k` of every row: what its errors move a split θ by.
+
+    Args:
+        slope: ∂θ_aux/∂w (nθ, nw).
+
+    Raises:
+        InputError: a fit without statistics.
+    """
+    statistics, nt, ny = model.statistics, len(slope), len(problem.outputs)
     if statistics.gram is None or model.numbers.tilt is not None:
         raise InputError(
             "the fit has no statistics for robust standard errors; fit the data again."
@@ -328,14 +343,10 @@ def robust_split_covariance(
     prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
     half = half_inverse(statistics.gram + np.diag(prior), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
-    chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(len(residual)), repeat=True))
-    moved = from_chunks(
-        np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root))), len(residual)
-    )
-    matrix = problem.weight.matrix
-    weighed = residual @ (matrix.T @ matrix)
-    scores = np.einsum("kro,ko->kr", moved.reshape(len(residual), nt, ny), weighed)
-    return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
+    rows = len(problem.rows)
+    chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(rows), repeat=True))
+    moved = np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root)))
+    return from_chunks(moved, rows).reshape(rows, nt, ny)
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:

@@ -164,6 +164,10 @@ class Weighted:
         return Points(x, _normalise(self.weights, len(x), "usable rows"))
 
 
+OF_ROWS = (Training, Symmetrized, Weighted)
+"""Measures whose points are those of the training rows, once or several times over."""
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Given points: a column per raw lag that the model reads, named as in expressions.

@@ -73,6 +73,8 @@ class MotionSplit:
     """
     field: Field
     support: float = 1.0
+    of_rows: bool = False
+    """Whether the points are those of the training rows."""
 
     @classmethod
     def empty(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:

@@ -154,6 +154,7 @@ def _parameters(result: FitResult) -> list[Any]:
     ]
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
+    blocks += _over_experiments(result)
     causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
     if causes:
         text, more = (
@@ -172,6 +173,24 @@ def _parameters(result: FitResult) -> list[Any]:
     if result.shared is not None:
         blocks.append(Text(result.shared.text, "note"))
     return blocks + _equations(result)
+
+
+def _over_experiments(result: FitResult) -> list[Any]:
+    """Return the intervals for experiments like those fitted, where there are several."""
+    over = result.over_experiments
+    if over is None:
+        return []
+    caption = (
+        f"For experiments like these {over.experiments}, from their own differences: each is left "
+        "out in turn. Where the ratio is large, the physics lacks something that other inputs "
+        "bring out otherwise."
+    )
+    columns = ["parameter", "standard error", "95 % interval", "times that of the inputs applied"]
+    rows = [
+        [row.name, number(row.std, 2), interval(row.ci95), number(row.ratio, 2)]
+        for row in (*over.parameters, *(over.physical_parameters or ()))
+    ]
+    return [Table(caption, columns, rows)]
 
 
 def bias_cell(row: ParameterResult) -> str:

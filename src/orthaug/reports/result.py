@@ -282,11 +282,37 @@ class PhysicsAloneResult(Content):
     scores: dict[str, PartScores]
 
 
+class ParameterOverExperiments(Content):
+    """A parameter's interval for experiments like those that were fitted."""
+
+    name: str
+    std: Number
+    ci95: Numbers
+    ratio: Number
+    """`std` over that of the applied inputs."""
+
+
+class OverExperimentsResult(Content):
+    """Intervals for experiments like those that were fitted, from their own differences."""
+
+    experiments: Whole
+    parameters: list[ParameterOverExperiments]
+    physical_parameters: list[ParameterOverExperiments] | None = None
+
+
 class FitResult(ResultHeader):
     """The result of `orthaug fit`."""
 
     absent: ClassVar = frozenset(
-        {"motion", "terms", "equation", "unexplained", "standard_errors_by", "intervals"}
+        {
+            "motion",
+            "terms",
+            "equation",
+            "unexplained",
+            "standard_errors_by",
+            "intervals",
+            "over_experiments",
+        }
     )
 
     spec: dict[str, Any]
@@ -299,6 +325,8 @@ class FitResult(ResultHeader):
     """Kind of the standard errors, a key of `fitting.estimates.STD_KINDS`; None for white noise.
     """
     physical_parameters: list[ParameterResult] | None
+    over_experiments: OverExperimentsResult | None = None
+    """Only of three experiments or more: intervals that hold for others like them."""
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
     structure: str
