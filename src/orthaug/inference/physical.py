@@ -137,12 +137,12 @@ class _Fit:
         end = least_squares(
             rows,
             np.clip(p[free] / scale, low / scale, high / scale),
-            lambda z: self.at(moved(z))[1][:, free] * scale,
+            lambda z: self.at(moved(z))[1][:, free] * scale,  # pyright: ignore[reportArgumentType]
             bounds=(low / scale, high / scale),
             method="dogbox",
             xtol=_STEP,
-            ftol=None,
-            gtol=None,
+            ftol=None,  # pyright: ignore[reportArgumentType]
+            gtol=None,  # pyright: ignore[reportArgumentType]
             max_nfev=_EVALUATIONS,
         )
         new = moved(end.x)
