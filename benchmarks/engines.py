@@ -98,7 +98,6 @@ def posed(source: Any, engine: Any) -> StreamedProblem:
 
 def a_pass(task: OneStepTask) -> Callable[[], Any]:
     """One linearisation: what an iteration costs."""
-    assert task.bound is not None
     w = np.asarray(task.bound.init(jax.random.key(0)))
     blocks = Blocks(task.bound)
     return lambda: jax.block_until_ready(task.engine.sum(blocks, task.rows, w, task._nothing))

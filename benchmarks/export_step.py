@@ -72,7 +72,6 @@ def paper_model() -> Model:
 def by_hand(model: Model) -> str:
     """What one would write for this model: arrays, two loops, no checks."""
     bound, numbers = model.form.bound, model.numbers
-    assert bound is not None
     w1, b1, w2, b2 = (np.asarray(leaf) for leaf in bound.leaves(np.asarray(numbers.weights)))
     gain = float(numbers.gain[0])
     tables = {

@@ -60,7 +60,7 @@ def problem(seed: int) -> Problem:
     }
     train = record(case, seed)
     returned = oa.estimate(train, motion(True), blocks=BLOCKS, **options)
-    kept = returned.model.form.bound is not None
+    kept = returned.learns
     fit = (
         returned if kept else oa.estimate(train, motion(True), blocks=0, fallback=False, **options)
     )

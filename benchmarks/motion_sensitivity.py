@@ -56,7 +56,7 @@ def ratio(rows: int, neurons: int, integrator: str, substeps: int) -> tuple[int,
     )
     problem = pose_motion(record, motion(integrator, substeps, neurons > 0), ["v"])
     task = MotionTask.of(problem, oa.MLP((neurons,)) if neurons else None, oa.Simulation(512, 0))
-    weights = np.zeros(0) if task.bound is None else np.asarray(task.bound.init(jax.random.key(0)))
+    weights = np.asarray(task.bound.init(jax.random.key(0)))
     plan = task.plan
     numbers = plan.numbers(problem.motion.coordinates.initial, weights)
     made = (plan.dynamics, numbers, plan.segments, plan.segments.start)

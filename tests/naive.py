@@ -17,7 +17,7 @@ def row(
     names = {**FUNCTIONS, **dict(form.baseline.constants), **signals, "k": k}
     inside, share = names, 1.0  # where the correction is read, and how much of it is left
     baseline, moved, raw = np.zeros((3, len(form.outputs)))
-    if form.bound is not None:
+    if form.learns:
         z = np.array(
             [float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries]
         )

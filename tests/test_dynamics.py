@@ -54,9 +54,10 @@ def form_of(name):
                                 outputs=[f"y{i + 1}" for i in range(ny)])  # fmt: skip
     posed = pose(record, Baseline.from_terms(terms), lags)
     nz, nt = posed.feature_rows().shape[1], len(posed.baseline.names)
-    bound = None if learner is None else Bound(learner, nz, ny)
-    form = LaggedDynamics(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
-    w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
+    bound = Bound.of(learner, nz, ny)
+    features, nz = replace(posed.features, entries=posed.features.entries[: bound.nz]), bound.nz
+    form = LaggedDynamics(posed.baseline, features, posed.layout, posed.outputs, bound)
+    w = np.asarray(bound.init(jax.random.key(1))) + 0.1
     scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     return form, Numbers(0.4 * rng.normal(size=nt), 0.3 * rng.normal(size=nt), w, *scaling), record
 

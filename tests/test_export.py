@@ -70,10 +70,11 @@ def lagged(terms, features, learner, outputs, inputs, constants=None) -> Model:
     lags = {*baseline.lags, *(lag for entry in entries for lag in entry.lags)}
     order = {name: i for i, name in enumerate((*outputs, *inputs))}
     layout = tuple(sorted(lags, key=lambda lag: (order[lag.channel], lag.lag)))
-    ny, nz, nt = len(outputs), len(entries), len(baseline.names)
-    bound = Bound(learner, nz, ny) if learner is not None else None
-    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(2)))
-    if bound is not None and not weights.any():
+    ny, nt = len(outputs), len(baseline.names)
+    bound = Bound.of(learner, len(entries), ny)
+    nz = bound.nz
+    weights = np.asarray(bound.init(jax.random.key(2)))
+    if bound.learns and not weights.any():
         weights = rng.normal(size=weights.shape)
     scaling = (0.2 * rng.normal(size=nz), 1 + rng.random(nz), 0.2 * (1 + rng.random(ny)))
     numbers = Numbers(0.3 * rng.normal(size=nt), 0.1 * rng.normal(size=nt), weights, *scaling)
@@ -95,8 +96,8 @@ def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionMo
     motion = motion.sampled(0.1)
     entries = tuple(parse_named(text, motion.known, "feature") for text in features)
     values = sum(map(len, motion.learned))
-    bound = Bound(learner, len(entries), values) if learner is not None else None
-    weights = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(4)))
+    bound = Bound.of(learner, len(entries), values)
+    weights = np.asarray(bound.init(jax.random.key(4)))
     q, nz = motion.coordinates.initial, len(entries)
     numbers = Numbers(
         q,

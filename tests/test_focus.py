@@ -63,7 +63,7 @@ def test_noise_on_the_sensor_asks_for_the_free_run():
         and "trained on the free run" in found.focus.text
     )
     assert free_run_error(found.model, test) < 0.7 * free_run_error(one_step.model, test)
-    assert found.physics_alone.model.form.bound is None
+    assert not found.physics_alone.learns
     assert free_run_error(found.model, test) < free_run_error(found.physics_alone.model, test)
 
 
@@ -83,7 +83,7 @@ def test_a_learner_that_finds_noise_is_left_out():
     found = oa.estimate(
         data, PHYSICS, learner=oa.MLP(hidden=(24,)), criterion=oa.Auto(), regularization="none"
     )
-    assert found.model.form.bound is None
+    assert not found.learns
     assert "physics_alone" in [warning.code for warning in found.warnings]
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
     assert min(errors, key=errors.get)[1] is False
@@ -96,9 +96,7 @@ def test_a_learner_that_is_wanted_is_kept():
     found = oa.estimate(data, PHYSICS, learner=oa.MLP(hidden=(24,)), **options)
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
     assert min(errors, key=errors.get)[1] is False
-    assert found.model.form.bound is not None and "one_step_only" not in [
-        w.code for w in found.warnings
-    ]
+    assert found.learns and "one_step_only" not in [w.code for w in found.warnings]
 
 
 def test_a_validation_part_chooses():
@@ -110,7 +108,7 @@ def test_a_validation_part_chooses():
         validation.experiments[0].outputs[2:]
         - found.model.simulate(validation).trajectories[0].model[2:]
     )
-    key = (found.focus.chosen, found.model.form.bound is not None)
+    key = (found.focus.chosen, found.learns)
     assert errors[key] == pytest.approx(float(np.sqrt(np.mean((own / unit) ** 2))), rel=1e-9)
 
 
@@ -211,7 +209,7 @@ def test_physics_is_there_where_the_learner_was_left_out(tmp_path, monkeypatch):
     write(tmp_path, SPEC.replace("hidden = [4]", "hidden = [24]") + NOISY.replace('focus = "prediction"\n', ""),
           rows=120, sensor=0.1, friction=0.0)  # fmt: skip
     assert run("fit", "spec.toml", "--out", "out").code == 0
-    assert oa.load(tmp_path / "out").form.bound is None
+    assert not oa.load(tmp_path / "out").learns
     assert run("simulate", "out", "last.csv", "--model", "physics", "--out", "p.csv").code == 0
 
 

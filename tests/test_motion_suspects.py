@@ -68,7 +68,7 @@ def usual_of(fit: oa.MotionEstimate) -> list[str]:
 
 def refitted(fit: oa.MotionEstimate, friction: float, size: float) -> np.ndarray:
     """By how much a unit of a spring that hardens moves the estimates, of data with one and with a softening one."""
-    learner = oa.MLP((4,), inputs=("v",)) if fit.model.form.bound is not None else None
+    learner = oa.MLP((4,), inputs=("v",)) if fit.learns else None
     options = {"learner": learner, "criterion": WHOLE, "blocks": 0}
     records = [data(friction=friction, hardening=sign * size) for sign in (1, -1)]
     ends = [

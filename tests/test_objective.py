@@ -65,7 +65,6 @@ def nowhere(given) -> Start:
 
 def points(given) -> tuple[np.ndarray, np.ndarray]:
     """A start and another place near it."""
-    assert given.task.bound is not None
     p = given.begin(np.asarray(given.task.bound.init(jax.random.key(0))))
     return p, p * (1 + 0.01 * np.random.default_rng(1).normal(size=len(p)))
 

@@ -67,7 +67,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     simulate = Model.simulate
 
     def simulating(self: Model, *args: object, **kwargs: object) -> object:
-        calls["simulate physics alone" if self.form.bound is None else "simulate"] += 1
+        calls["simulate physics alone" if not self.learns else "simulate"] += 1
         return simulate(self, *args, **kwargs)
 
     monkeypatch.setattr(Model, "simulate", simulating)

@@ -44,7 +44,6 @@ def fitted(iterations: int, structure=STRUCTURE, **options):
 def test_normal_equations_are_those_of_all_columns(known):
     problem = pose(*example())
     task = OneStepTask.of(problem, LEARNER)
-    assert task.bound is not None
     physics = Physics.of(problem, eliminate(STRUCTURE, problem), {}, 0.0, task.rms, solved=False)
     rng = np.random.default_rng(0)
     p = jnp.asarray(rng.normal(size=2 + task.bound.size))

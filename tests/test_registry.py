@@ -110,9 +110,7 @@ def test_a_learner_from_outside(project, tmp_path):
         done = run("fit", spec, "--out", tmp_path / "out", "--json")
         assert done.code == 0, done.err
         model = load(tmp_path / "out")
-        assert model.form.bound is not None and model.form.bound.learner == Powers(
-            2, (1.0, 2.5), ("u[k-1]", "y[k-1]")
-        )
+        assert model.form.bound.learner == Powers(2, (1.0, 2.5), ("u[k-1]", "y[k-1]"))
         assert model.form.bound.size == 2
     with pytest.raises(
         InputError, match="learner is of the kind 'powers', which is not registered here"

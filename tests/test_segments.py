@@ -85,12 +85,13 @@ def case(name):
         record_of(ny), Baseline.from_terms(terms), lags, None if learner is None else learner.inputs
     )
     nz = posed.feature_rows().shape[1]
-    bound = None if learner is None else Bound(learner, nz, ny)
-    form = LaggedDynamics(posed.baseline, posed.features, posed.layout, posed.outputs, bound)
-    w = np.zeros(0) if bound is None else np.asarray(bound.init(jax.random.key(1))) + 0.1
+    bound = Bound.of(learner, nz, ny)
+    features, nz = replace(posed.features, entries=posed.features.entries[: bound.nz]), bound.nz
+    form = LaggedDynamics(posed.baseline, features, posed.layout, posed.outputs, bound)
+    w = np.asarray(bound.init(jax.random.key(1))) + 0.1
     c = 0.4 * rng.normal(size=len(posed.baseline.names))
     scaling = (np.zeros(0), np.zeros(0), np.zeros(ny))
-    if bound is not None:
+    if bound.learns:
         scaling = (rng.normal(size=nz), 1 + rng.random(nz), 0.5 * (1 + rng.random(ny)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(orthaug.fitting.segments, "CHUNK", 9)

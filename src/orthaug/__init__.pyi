@@ -84,6 +84,8 @@ from .physics import PhysicsMap as PhysicsMap
 from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
+from .physics.systems import HammersteinWiener as HammersteinWiener
+from .physics.systems import System as System
 from .reports import plot as plot
 from .selection import Explanation as Explanation
 from .selection import Selection as Selection

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from annotated_types import Ge, Gt
+from annotated_types import Ge, Gt, Le
 
-from orthaug._base.checks import check_choice, check_count, check_number, nearest
+from orthaug._base.checks import check_choice, check_count, check_number, check_type, nearest
 from orthaug._base.errors import InputError, KeyedError
 
 LIBRARY_ONLY = {"library_only": True}
@@ -194,10 +194,8 @@ class Registry(Mapping[str, Any]):
             InputError: an unknown kind, a missing key, or what the declaration refuses.
         """
         if kind not in self._entries:
-            raise InputError(
-                f"unknown {self.axis} "
-                f"'{kind}'{nearest(kind, self) or ', known are ' + ', '.join(self)}."
-            )
+            hint = nearest(kind, self) or f"; known are {', '.join(self)}."
+            raise InputError(f"unknown {self.axis} '{kind}'{hint}")
         known = keys_of(self._entries[kind])
         for name, key in known.items():
             if key.default is dataclasses.MISSING and name not in values:
@@ -243,6 +241,11 @@ def check_fields(declared: Any) -> None:
             check_count(value, name, least=int(typing.cast(Any, low)))
         elif key.type is float and (low is not None or positive):
             check_number(value, name, positive=positive)
+        elif key.type is bool:
+            check_type(value, bool, name, "true or false")
+        high = next((mark.le for mark in metadata if isinstance(mark, Le)), None)
+        if high is not None and value > high:
+            raise InputError(f"`{name}` must be {high} or less; got {value}.")
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

@@ -199,8 +199,7 @@ def linearization_of(
 ) -> MeasureLinearization:
     """Return the linearization of a fit for biases, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)
-    learns = fit.model.form.bound is not None
-    learned = fit.model.learner_at(weighed.points.x) if learns else None
+    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
     return MeasureLinearization(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
 
 
@@ -212,7 +211,7 @@ def lagged_budget(
     measure: Measure | None = None,
 ) -> Budget | None:
     """Return `bias_budget` of a fit of difference equations."""
-    if not fit.status.ok or fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+    if not fit.status.ok or fit.model.structure != "orthogonal":
         return None
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name

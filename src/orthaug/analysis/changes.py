@@ -349,7 +349,7 @@ class Candidates:
     def _learner(self) -> str:
         """Return a clause on the inputs that a learner could be given."""
         model, problem = self.fit.model, self.fit.problem
-        if model.form.bound is None:
+        if not model.learns:
             return "a learner"
         visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]

@@ -212,7 +212,7 @@ def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
     if isinstance(model, MotionModel):
         names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
         found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
-        seen = form.seen(run.states.T, run.inputs.T, np) if form.bound is not None else ()
+        seen = form.seen(run.states.T, run.inputs.T, np)
         found |= {
             str(entry): row
             for entry, row in zip(form.features, seen, strict=False)
@@ -236,8 +236,6 @@ def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
 def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
     """Return the learner's inputs along the run, (T, nz)."""
     form: Any = model.form
-    if form.bound is None:
-        return np.zeros((len(run.error), 0))
     if isinstance(model, MotionModel):
         return np.asarray(form.seen(run.states.T, run.inputs.T, np)).T
     return np.asarray(

@@ -15,7 +15,7 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Learner
+from orthaug.models.learners import Learner, nothing_learned
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.motion_problem import MotionProblem
 
@@ -129,7 +129,7 @@ def refit_physics(
     """
     plan = task.plan
     segmented = SegmentedMotion.of(
-        replace(plan.problem, motion=motion, record=record), None, plan.criterion
+        replace(plan.problem, motion=motion, record=record), nothing_learned(), plan.criterion
     )
     segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps).from_states(
         free_fit.end.point.states

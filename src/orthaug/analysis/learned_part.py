@@ -59,7 +59,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
     then holds both.
     """
     made, slope = free_covariance(fit), fit.split_by.slope
-    if made is None or slope is None or fit.model.form.bound is None or fit.unidentified:
+    if made is None or slope is None or fit.unidentified:
         return None
     joint, moves = made
     by_q, beside = (np.asarray(part) for part in _slopes(fit.model.form, fit.model.numbers, x, u))

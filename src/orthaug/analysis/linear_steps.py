@@ -74,7 +74,7 @@ class LaggedStep:
 
         None where it is unknown which of them training reached.
         """
-        if self.form.bound is None or not self.form.differentiable:
+        if not self.form.differentiable:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
         x = np.array([[now[lag.channel] for lag in self.form.layout]])
@@ -126,7 +126,7 @@ class MotionStep:
         return (rates if self.continuous else rates - rest), y
 
     def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
-        if self.form.bound is None or not self.form.differentiable:
+        if not self.form.differentiable:
             return None
         return np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]
 

@@ -95,11 +95,7 @@ def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags
         one_step: the prediction of the training data, if it is there already.
     """
     problem = fit.problem
-    if (
-        fit.model.form.bound is None
-        or fit.criterion.free_run is not None
-        or not problem.features.entries
-    ):
+    if fit.criterion.free_run is not None or not problem.features.entries:
         return None
     visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [j for j, one in enumerate(visible) if not one]

@@ -153,7 +153,7 @@ class MotionLinearization:
     @property
     def learns(self) -> bool:
         """True if there is a learner."""
-        return self.place.segmented.bound is not None
+        return self.place.segmented.bound.learns
 
     @cached_property
     def phi(self) -> Projection:
@@ -416,7 +416,7 @@ def softened_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> lis
 
     Nothing without a learner: it alone shows the shape of what is missing.
     """
-    if fit.model.form.bound is None:
+    if not fit.learns:
         return []
     field = fit.split_by.field
     smooth = soften_jumps(suspects, fit.problem.motion, fit.values, field.x, field.u)
@@ -451,7 +451,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionLinearization | None:
     ridge = fit.model.statistics.ridge / fit.scores.unit
     c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
     place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
-    if fit.model.form.bound is not None:
+    if fit.learns:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)
     unknown = (*fit.unidentified, *fit.at_bound)
@@ -474,7 +474,7 @@ def linearize_physics(task: MotionTask, structure: Structure) -> MotionLineariza
         segmented, point.theta, weights, point.states, task.physics.objective.weight
     )
     none = MotionSplit.empty("training", form, point.theta)
-    if segmented.bound is None:
+    if not segmented.bound.learns:
         return MotionLinearization(place, point.theta, none.shared, none.field)
     field = field_under(
         structure.measure,

@@ -152,7 +152,7 @@ def motion_budget(
         families: the same of members of the catalogue (`families_of`).
         declared: the suspects that were declared; by default those of the table.
     """
-    learns = fit.model.form.bound is not None
+    learns = fit.learns
     found = _of_learner(fit, table, smooth, families) if learns else _of_residual(table)
     if found is None:
         return None

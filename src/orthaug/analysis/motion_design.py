@@ -28,6 +28,7 @@ from orthaug.analysis.design import (
 from orthaug.analysis.motion_suspects import MotionSuspect
 from orthaug.analysis.plant import RUNS_AWAY
 from orthaug.models.dynamics import Numbers
+from orthaug.models.learners import nothing_learned
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.integrators import inputs_at_points
 from orthaug.physics.motion import Motion
@@ -78,7 +79,7 @@ class MotionPlant:
             [start if isinstance(start, float | int) else 0.0 for start in starts], dtype=float
         )
         suspected = SuspectedMotion.of(motion, [suspect.term(motion) for suspect in suspects])
-        self._form = MotionDynamics(suspected, (), None, sampling_time, substeps)
+        self._form = MotionDynamics(suspected, (), nothing_learned(), sampling_time, substeps)
         self._coefficients = np.array([suspect.coefficient for suspect in suspects], dtype=float)
         coordinates = motion.coordinates
         q = coordinates.of(self.theta)

@@ -19,7 +19,6 @@ from orthaug.analysis.predictability import Predictable, from_lags, from_own_pas
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import Diagnosis
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import without_learner
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.models.response import Response
@@ -90,9 +89,8 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
     It runs in the same compiled programs.
     """
-    solver, bound = LevenbergMarquardt().within_limit, fit.model.form.bound
-    posed, learner = (fit.problem, bound.learner) if bound else (without_learner(fit.problem), None)
-    return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
+    solver, learner = LevenbergMarquardt().within_limit, fit.model.form.bound.learner
+    return dead_times(on_longest(fit.problem, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _colour_sentence(fit: MotionEstimate) -> str:
@@ -143,11 +141,7 @@ def _words(
         noise = "is white: noise on the outputs, which the training assumes."
         return f"The free run's error ({sizes}) {noise}{_traces(tests, shares)}"
     if verdict == "equation_noise":
-        learner = (
-            "that the learner does not see"
-            if fit.model.form.bound is not None
-            else "(a learner would show which)"
-        )
+        learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
         no_input = "no input, " if fit.problem.motion.inputs else ""
         return (
             f"The free run's error ({sizes}) is coloured ({_colour(tests, shares)}). It follows "

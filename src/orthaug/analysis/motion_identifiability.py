@@ -19,6 +19,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.models.learners import nothing_learned
 from orthaug.physics import ill_conditioned
 from orthaug.physics.excitation import Excitation, of_gram
 
@@ -162,7 +163,7 @@ def _richly_excited(segmented: SegmentedMotion, wide: float) -> SegmentedMotion:
 
 def _with_record(segmented: SegmentedMotion, record: Record) -> SegmentedMotion:
     """Return the same segments on another record."""
-    whole = SegmentedMotion.of(segmented.problem.on(record), None, segmented.criterion)
+    whole = SegmentedMotion.of(segmented.problem.on(record), nothing_learned(), segmented.criterion)
     return (
         whole
         if segmented.free_run == segmented.criterion.free_run

@@ -189,7 +189,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
     segmented = place.segmented.with_signals(_signals(place, added))
     suspected = SuspectedMotion.of(motion, added)
     bound, w = segmented.bound, place.w
-    if bound is not None and not len(w):
+    if len(w) < bound.size:  # a learner that is not trained yet
         bound = Bound(Waves(), bound.nz, bound.ny)
         w = np.zeros(bound.size)
     form = replace(segmented.dynamics, motion=suspected, bound=bound)

@@ -169,7 +169,7 @@ class Observer:
         if form.hidden:
             alone = self.model.physics_only.filtering
             known = parts
-            if self.model.form.bound is not None:
+            if self.model.learns:
                 known = predict_outputs(alone[0], alone[1], self.noise, before, inputs, horizon)[0]
             parts = Parts(known.total, parts.total - known.total, parts.total - known.total)
         skip = first - form.first_row - horizon + 1

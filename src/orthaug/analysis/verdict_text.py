@@ -176,11 +176,7 @@ def _white(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.complete and seen.inconsistent is not None:
         return "The one-step residual is slightly coloured, but enough to move θ.", ()
     if seen.complete:
-        so = (
-            "the intervals hold"
-            if seen.fit.model.form.bound is None
-            else "the tests find only noise"
-        )
+        so = "the intervals hold" if not seen.fit.learns else "the tests find only noise"
         return (
             f"The one-step residual is white: {so}, and no criterion is better than this one.",
             (),

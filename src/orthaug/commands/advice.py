@@ -109,7 +109,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     """Yield the suspects that explain most of the learned part, or of the physics' residual."""
-    plain = job.spec.motion is None and fit.model.form.bound is None and len(fit.theta) > 0
+    plain = job.spec.motion is None and not fit.learns and len(fit.theta) > 0
     left = _residual_columns(fit) if plain else None
     found = []
     for entry in result.bias or ():
@@ -302,7 +302,7 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     if spec.declared_learner() is None:
         yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
         return
-    if bound is None:  # it was tried, and physics alone was better
+    if not bound.learns:  # it was tried, and physics alone was better
         return
     visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
@@ -345,12 +345,7 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
         return
     now = job.spec.learner_inputs()
     learned = {job.problem.motion.names_of_states[i] for i in job.problem.motion.learned[0]}
-    if (
-        fit.model.form.bound is None
-        or now is None
-        or best.equation not in learned
-        or _reads(now, best.variable)
-    ):
+    if not fit.learns or now is None or best.equation not in learned or _reads(now, best.variable):
         return
     change = {"learner.inputs": [*now, best.variable]}
     yield Proposal(f"a learner that also sees {best.variable}", change, learns=True)
@@ -501,7 +496,7 @@ def advise(
         rows = ValidationRows.of(job)
     except InputError:
         return None
-    learns = fit.model.form.bound is not None
+    learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     motion = result.motion
     substeps = None if motion is None or motion.discrete else motion.substeps

@@ -125,12 +125,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
     """
     spec: Spec = job.spec
     chosen, bound = spec.selection.chosen_on, fit.model.form.bound
-    if (
-        chosen is None
-        or spec.motion is not None
-        or bound is None
-        or not isinstance(bound.learner, Terms)
-    ):
+    if chosen is None or spec.motion is not None or not isinstance(bound.learner, Terms):
         return None
     train = Rows.of(expand_files(job.path, spec.data.train.files, "train"), spec.data.train.rows)
     if Rows.of(chosen.files, chosen.rows).meets(train, job.path.parent):

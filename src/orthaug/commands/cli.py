@@ -225,6 +225,14 @@ def init(
     sampling_time: Annotated[
         float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")
     ] = None,
+    system: Annotated[
+        str | None,
+        typer.Option(
+            "--system",
+            metavar="KIND[,KEY=VALUE]",
+            help="Physics instead of linear lags: hammerstein_wiener,order=3.",
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Look at a data file, and write a first spec that runs.
@@ -234,9 +242,11 @@ def init(
     from orthaug._base.errors import InputError
     from orthaug.commands.folder import check_file
     from orthaug.commands.init import assign, draft, look, question, write_spec
+    from orthaug.commands.written_motion import system_of
     from orthaug.data.record import check_step
 
     check_file(out, data, force=force)
+    declared = None if system is None else system_of(system)
     if sampling_time is not None:
         check_step(sampling_time)
     large = data.is_file() and data.stat().st_size > _LARGE
@@ -267,7 +277,7 @@ def init(
         )
     assert roles is not None  # both are given
     report_stage("looking at signals, delays and orders")
-    spec = draft(found, roles, out)
+    spec = draft(found, roles, out, declared)
     report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
     streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")

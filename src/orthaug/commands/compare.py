@@ -70,11 +70,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         if refusal is not None:
             left_out[kind] = refusal
             continue
-        if (
-            decided is not None
-            and kind == job.spec.structure.kind
-            and decided.fit.model.form.bound is not None
-        ):
+        if decided is not None and kind == job.spec.structure.kind and decided.fit.learns:
             fitted[kind] = decided
             continue
         fitted[kind] = with_doubts(
@@ -198,7 +194,7 @@ def _row_of(
     name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **content: Any
 ) -> RowResult:
     """Return a row of the table; keys that `content` lacks are null."""
-    own = {"name": name, "weights": model.form.bound.size if model.form.bound else 0}
+    own = {"name": name, "weights": model.form.bound.size}
     return RowResult.model_validate(
         dict.fromkeys(RowResult.model_fields)
         | own

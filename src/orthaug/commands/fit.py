@@ -99,7 +99,8 @@ def with_advice(fitted: FitReport) -> FitReport:
 def with_verdict(fitted: FitReport) -> FitReport:
     """Return a fit with the verdict on its learner."""
     job, fit, warnings = fitted.job, fitted.fit, list(fitted.result.warnings)
-    if not fit.status.ok or (fit.model.form.bound is None and fit.held_out is None):
+    learns = fit.learns
+    if not fit.status.ok or not (learns or fit.held_out is not None):
         return fitted
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fitted))
@@ -111,13 +112,13 @@ def with_verdict(fitted: FitReport) -> FitReport:
         None,
     )
     warnings += failed
-    asked = fit.model.form.bound is not None and job.spec.validation.blocks != 0
+    asked = learns and job.spec.validation.blocks != 0
     if verdict is None and asked and not failed:
         short = "the training data have too few rows for cross-validation in so many blocks"
         why = "training was stopped too early for cross-validation" if _was_stopped(fit) else short
         text = f"whether the learner helps is not judged: no part is held out, and {why}."
         warnings.append(WarningResult(code="not_judged", text=text))
-    if verdict is not None and fit.model.form.bound is not None:
+    if verdict is not None and learns:
         text = (
             *verdict.warnings,
             *_unexplained_warnings(fitted, None if verdict.code == "helps" else physics),
@@ -235,11 +236,7 @@ def report_of(job: Job, fit: Any) -> FitReport:
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
-    if (
-        fit.status.ok
-        and job.spec.training.chosen_focus() == "prediction"
-        and fit.model.form.bound is not None
-    ):
+    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.learns:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )
@@ -399,7 +396,7 @@ def judge_fit(
     job, model, chosen_by = fitted.job, fitted.fit.model, fitted.fit.held_out
     held_out = job.parts[1:]
     simulated = fitted.fit.criterion.simulates
-    if chosen_by is not None and model.form.bound is None:
+    if chosen_by is not None and not model.learns:
         return judge(trials_of(chosen_by)) if simulated else None
     if blocks is None:
         wanted = wanted_blocks(job)
@@ -541,11 +538,7 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     (folder / "model").mkdir()
     storage.write(fitted.fit.model, folder / "model")
     physics = fitted.fit.physics_alone
-    if (
-        physics is None
-        and fitted.fit.model.form.bound is None
-        and fitted.job.spec.declared_learner() is not None
-    ):
+    if physics is None and not fitted.fit.learns and fitted.job.spec.declared_learner() is not None:
         physics = fitted.fit  # the learner was left out
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
@@ -573,7 +566,7 @@ def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     from orthaug.reports.page_fit import FitPage
 
     job, fit, responses = fitted.job, fitted.fit, fitted.responses
-    alone = {} if fit.model.form.bound is None else kind_of(job).physics_alone(job, fit, responses)
+    alone = kind_of(job).physics_alone(job, fit, responses) if fit.learns else {}
     learned = learned_of(fit, job.train.record)
     return fit_page(
         FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned)

@@ -14,6 +14,7 @@ from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import relative
+from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
@@ -21,6 +22,8 @@ from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
 from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
+from orthaug.physics.motion import Motion
+from orthaug.physics.systems import System
 from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
 
 FILLED = 3
@@ -90,8 +93,12 @@ def spec_text(
     gaps: str,
     named: tuple[list[str], list[str]],
     model: FirstModel,
+    motion: Motion | None = None,
 ) -> str:
-    """Return the spec with comments; `gaps` says which rows will be left out, "" for none."""
+    """Return the spec with comments; `gaps` says which rows will be left out, "" for none.
+
+    The physics is `motion`, or else the first model.
+    """
     document = tomlkit.document()
     document.add(
         tomlkit.comment(
@@ -103,20 +110,24 @@ def spec_text(
     )
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
-    document.add(
-        tomlkit.comment(
-            "The physics: linear difference equations, to be replaced by what you know "
-            "([motion]: equations of motion)."
-        )
-    )
-    document.add("baseline", _baseline(named, model))
-    learner = tomlkit.table()
-    learner.add("kind", "mlp")
-    learner.add("hidden", [8])
-    learner["hidden"].comment(
-        "sees the lags that the physics reads; [lags] gives it more, `inputs` fewer"
-    )
-    document.add("learner", learner)
+    if motion is None:
+        linear = "linear difference equations, to be replaced by what you know"
+        document.add(tomlkit.comment(f"The physics: {linear} ([motion]: equations of motion)."))
+        document.add("baseline", _baseline(named, model))
+        sees = "the lags that the physics reads; [lags] gives it more, `inputs` fewer"
+    else:
+        document.add(tomlkit.comment("The physics: equations of motion, for you to change."))
+        document.add("motion", motion_section(motion))
+        sees = ", ".join(motion.inputs if motion.learned[0] else motion.names_of_states)
+    if motion is None or motion.learned[0] or motion.learned[1]:
+        learner = tomlkit.table()
+        learner.add("kind", "mlp")
+        learner.add("hidden", [8])
+        if motion is None:
+            learner["hidden"].comment(f"sees {sees}")
+        else:
+            learner.add("inputs", sees.split(", "))
+        document.add("learner", learner)
     training = tomlkit.table()
     training.add("restarts", 3)
     document.add("training", training)
@@ -395,8 +406,10 @@ def _list_columns(columns: Sequence[str]) -> str:
     return ", ".join(columns[:_LISTED]) + more
 
 
-def draft(found: Survey, roles: Roles, out: Path) -> Draft:
+def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) -> Draft:
     """Return a spec that runs on a file, for the place `out`, and a description of the file.
+
+    Its physics is the system, with initial values from the file, or else linear lags.
 
     Raises:
         InputError: too few rows, or channels without a row where all have a value.
@@ -419,7 +432,8 @@ def draft(found: Survey, roles: Roles, out: Path) -> Draft:
         f"{'is' if lost == 1 else 'are'} left out"
     )
     gaps = gap_text(missing) if missing else wild if lost else ""
-    text = spec_text(found, roles, out, rows, cut, gaps, named, model)
+    motion = None if system is None else system.motion(record)
+    text = spec_text(found, roles, out, rows, cut, gaps, named, model, motion)
     return Draft(
         text,
         _account(

@@ -134,9 +134,7 @@ def content(
             "the bias that the learner implies", partial(_budget_of, job, fit), warnings, None
         )
     warnings += budget.warnings if budget else ()
-    if (
-        fit.model.structure != "orthogonal" or fit.model.form.bound is None
-    ):  # a variant, not the declared structure
+    if fit.model.structure != "orthogonal":  # a variant, not the declared structure
         shared = None
     fields["parameters"] = _with_biases(
         rows, shared.determined if shared else None, budget, fit.at_bound
@@ -178,7 +176,7 @@ def figures(
                 drawn[f"residuals_{kind.replace('-', '_')}"] = figure
     if result.bias:
         drawn["bias"] = finding_plots.bias_figure(result.bias)
-    if fit.model.form.bound is not None:
+    if fit.learns:
         drawn["components"] = plots.components_figure(
             one_step, f"parts of the one-step prediction, {where}"
         )
@@ -269,7 +267,7 @@ def _budget_of(job: LaggedJob, fit: Estimate) -> Budget | None:
     """Return the bias that what the learner found implies, under the spec's measure."""
     from orthaug.analysis.budget import budget_on
 
-    if fit.model.structure != "orthogonal" or fit.model.form.bound is None:
+    if fit.model.structure != "orthogonal":
         return None
     linearization = _linearization(job, fit)
     return budget_on(linearization, fit, declare_suspects(job.spec.suspects, linearization.problem))
@@ -306,7 +304,7 @@ def _linearization(job: LaggedJob, fit: Estimate | None) -> MeasureLinearization
     if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors that the fit left
         problem = fit.problem
         weighed = weigh_problem(job.measure, problem)
-    learned = None if fit.model.form.bound is None else fit.model.learner_at(weighed.points.x)
+    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
     return MeasureLinearization(weighed, problem, fit.theta, job.physics, learned, fit.model.shared)
 
 
@@ -315,11 +313,7 @@ def _shared_warnings(job: LaggedJob, fit: Estimate | None = None) -> list[Warnin
     structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
     if job.spec.declared_learner() is None or not structure.projects or structure.shared == "all":
         return []
-    if (
-        not problem.baseline.names
-        or not problem.features.entries
-        or (fit and fit.model.form.bound is None)
-    ):
+    if not problem.baseline.names or not problem.features.entries:
         return []
     return shared_warnings(problem.shared, [str(entry) for entry in problem.features.entries])
 

@@ -161,7 +161,7 @@ class FitFacts:
     def declared_learner(self) -> Any:
         """Return the learner; None without one."""
         bound = self.fit.model.form.bound
-        return None if bound is None else bound.learner
+        return bound.learner if bound.learns else None
 
     def declared_structure(self, kind: str | None = None, measure: Any = None) -> Any:
         """Return the kind of structure that was fitted."""
@@ -237,12 +237,7 @@ def _write_page(text: str, path: Path | None) -> Page:
 def _account(fit: Estimate | MotionEstimate) -> str:
     """Return the text in the place of the spec."""
     physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
-    bound = fit.model.form.bound
-    declared = (
-        fit.problem.record,
-        physics,
-        f"learner: {'none' if bound is None else bound.learner}",
-    )
+    declared = (fit.problem.record, physics, f"learner: {fit.model.form.bound.learner}")
     lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, declared))
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 

@@ -51,11 +51,12 @@ def check(job: MotionJob) -> CheckResult:
     from orthaug.fitting.segmented_motion import SegmentedMotion
     from orthaug.inference.motion_split import shared_of_motion
     from orthaug.inference.nearly_shared import shared_warnings
+    from orthaug.models.learners import nothing_learned
     from orthaug.models.moving import MotionDynamics
 
     problem, spec = job.problem, job.spec
     motion, criterion = problem.motion, spec.declared_criterion()
-    segmented = SegmentedMotion.of(without_learner(problem), None, criterion)
+    segmented = SegmentedMotion.of(without_learner(problem), nothing_learned(), criterion)
     identification = identify_ranks(segmented)
     if identification is None:
         wild = "".join(
@@ -70,7 +71,11 @@ def check(job: MotionJob) -> CheckResult:
     shared, on_rows = None, []
     if spec.declared_learner() is not None and job.structure.shared != "all":
         form = MotionDynamics(
-            motion, problem.features, None, problem.record.sampling_time, problem.substeps
+            motion,
+            problem.features,
+            nothing_learned(),
+            problem.record.sampling_time,
+            problem.substeps,
         )
         shared = imitation_before(
             form, motion.coordinates.initial, identification.states, identification.inputs
@@ -183,7 +188,7 @@ def content(
         warnings += closed_loop(job.train.record)
         fields |= {name: found[name] for name in ("residuals", "stability", "bias")}
     budget, coarse, parts = found["budget"], found["coarse"], found["parts"] or ()
-    if fit.status.ok and form.bound is not None:
+    if fit.status.ok and fit.learns:
         seen = [str(entry) for entry in form.features]
         fields["shared"] = MotionImitation.of(seen, fit.shared)
         warnings += shared_warnings(fit.shared, seen)
@@ -251,7 +256,7 @@ def _analyse(
         ),
         "parts": None,
     }
-    if fit.model.form.bound is not None:
+    if fit.learns:
         found["parts"] = attempt(
             "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
         )
@@ -274,7 +279,7 @@ def figures(
 
     part = job.parts[-1]
     one_step, free = responses[part.name]
-    learns = fit.model.form.bound is not None
+    learns = fit.learns
     drawn = {
         "simulation": plots.output_figure(free, f"free run, {part.name}", learns=learns),
         "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
@@ -308,7 +313,7 @@ def _parameters(fit: MotionEstimate, budget: MotionBudget | None) -> list[Parame
     motion = fit.problem.motion
     values = fit.values if fit.status.ok else np.full(len(motion.names), np.nan)
     rows = parameter_rows(motion.parameters, values, fit.std, fit.interval, plain_std=fit.plain_std)
-    learns = fit.model.form.bound is not None and fit.status.ok
+    learns = fit.learns and fit.status.ok
     imitable = [row.name not in fit.shared.untouched if learns else None for row in rows]
     biases = [budget.of(row.name) if budget else None for row in rows]
     return [

@@ -220,15 +220,14 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
 def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
     """Return initial states: in the middle of the learner's features, zero, one."""
     zero = np.zeros(len(program.states))
-    if model.form.bound is not None:
-        entries = model.form.features.entries if isinstance(model, Model) else model.form.features
-        centres = {
-            entry.text.partition("[")[0]: c
-            for entry, c in zip(entries, model.numbers.centre, strict=True)
-        }
-        yield np.array(
-            [float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states]
-        )
+    entries = model.form.features.entries if isinstance(model, Model) else model.form.features
+    centres = {
+        entry.text.partition("[")[0]: c
+        for entry, c in zip(entries, model.numbers.centre, strict=True)
+    }
+    yield np.array(
+        [float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states]
+    )
     yield zero
     yield zero + 1
 
@@ -236,8 +235,6 @@ def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
 def _range(model: Any, program: Program) -> tuple[Any, Any]:
     """Return middle and half width of each input in the learner's features; 0 and 1 elsewhere."""
     middle, reach = np.zeros(program.held), np.ones(program.held)
-    if model.form.bound is None:
-        return middle, reach
     entries = model.form.features.entries if isinstance(model, Model) else model.form.features
     names = [signal.name for signal in program.inputs[: program.held]]
     for entry, centre, width in zip(

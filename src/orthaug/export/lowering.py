@@ -171,7 +171,7 @@ def _lower_lagged(model: Model, name: str, digest: str) -> Program:
     constants.symbols |= {} if held is None else held.symbols
     sums, corrections = _weighted_terms(model, constants, lower_expression, held)
     network = None
-    if form.bound is not None:
+    if form.learns:
         seen = features if held is None else held.features
         network = _network(form.bound, numbers, seen, np.arange(len(form.outputs)))
         for i, summands in enumerate(sums):
@@ -240,7 +240,7 @@ def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
     }
     for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
         unit = f" [{parameter.unit}]" if parameter.unit else ""
-        beside = "" if form.bound is None else ", beside the learner"
+        beside = ", beside the learner" if form.learns else ""
         names[parameter.name] = constants.node(
             "p", parameter.name, value, f"{parameter.name}{unit}{beside}"
         )
@@ -298,7 +298,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
         return node_of(expression, names, {}, numeric)
 
     features = [lower_expression(entry) for entry in form.features]
-    learned_states, learned_outputs = motion.learned
+    learned_states, learned_outputs = form.corrected
     equations = {"rate": [*motion.equations.values()], "output": [*motion.observations]}
     results = {
         kind: list(map(lower_expression, expressions)) for kind, expressions in equations.items()
@@ -329,7 +329,7 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
         ("rate", learned_states, 0),
     ):
         network = None
-        if form.bound is not None and learned:
+        if learned:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):

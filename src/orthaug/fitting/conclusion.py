@@ -14,7 +14,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug.data.record import Record
-from orthaug.data.regressors import Lags
+from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
 from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
@@ -56,7 +56,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         task: the problem's rows, to sum over.
         learned: of these rows, or of a free run on the same problem.
     """
-    problem = task.problem
+    problem, learns = task.problem, learned.bound.learns
     warnings: list[Warning] = []
     if is_unfinished(learned) and follows_training(structure, problem, learned):
         learned = withheld(learned)
@@ -75,7 +75,7 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         theta, theta_aux, fixed = split_theta(structure, problem, there, learned.coefficients, held)
     errors = learned.errors or _one_step_errors(task, structure, learned, theta - theta_aux, fixed)
     noise = errors.noise if ending.usable else None
-    identified = structure.projects or (learned.bound is None and structure.identifies)
+    identified = structure.projects or (not learns and structure.identifies)
     known = noise is not None and identified and not learned.elsewhere
     warnings += [] if learned.elsewhere else learner_silent(learned)
     warnings += ill_conditioned.of_physics(
@@ -93,10 +93,10 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
     ):
         warnings.append(Warning("no_standard_errors", _UNDETERMINED))
-    reason = ALONE.get(ending, "") if learned.bound is None else ""
+    reason = ALONE.get(ending, "") if not learns else ""
     reason = reason or ending_in_words(ending, learned.tail)
     model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
-    partly = learned.bound is not None and structure.projects and structure.shared != "all"
+    partly = learns and structure.projects and structure.shared != "all"
     shared = problem.shared if partly and problem.features.entries else None
     return Estimate(
         model=model,
@@ -194,7 +194,9 @@ def _one_step_errors(
     noise = covariance = None
     if mixed is not None:
         noise = problem.weight.covariance(mixed)
-        if learned.bound is None or (structure.projects and directions(structure, problem) is None):
+        if not learned.bound.learns or (
+            structure.projects and directions(structure, problem) is None
+        ):
             middle = task.physics_middle(mixed) if ny > 1 else mixed[0, 0] * np.eye(len(c))
             covariance = theta_covariance(problem.projection, middle, fixed)
         elif structure.projects:
@@ -319,7 +321,7 @@ def _warnings(
         )
         if (
             structure.projects
-            and learned.bound is not None
+            and learned.bound.learns
             and directions(structure, problem) is not None
         ):
             text += "the learner is not made orthogonal to it; "
@@ -349,12 +351,12 @@ def orthogonalize(
     external = External(function, ny=ny)
     values = external.values(problem.feature_rows())  # once; the sums below read what it gave
     scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
-    task = OneStepTask.of(problem, None)
+    task = OneStepTask.of(replace(problem, features=Features(())), None)
     gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
     rows = task.engine.build_rows(
         values, problem.projection.q, problem.unexplained / task.rms, gain
     )
-    task = replace(task, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
+    task = replace(task, problem=problem, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
     concluded = conclude(
         task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True)
     )

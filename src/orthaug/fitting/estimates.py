@@ -115,6 +115,11 @@ class AnyFit(FitView):
         """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
         return self.model.theta
 
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.model.learns
+
     @cached_property
     def terms(self) -> pd.DataFrame:
         """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
@@ -492,8 +497,6 @@ class Estimate(AnyFit):
         if self.measure is not None and self.measure.slope is not None:
             return self.measure.slope
         problem = self.problem
-        if self.model.form.bound is None:
-            return np.zeros((len(self.theta), 0))
         if isinstance(problem, StreamedProblem):
             return streamed_slope(self.model, problem)
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
@@ -507,7 +510,7 @@ class Estimate(AnyFit):
         recordings = problem.record.recordings
         experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
         whole = split is None and self.model.shared is None
-        if self.criterion.one_step and (whole or self.model.form.bound is None):
+        if self.criterion.one_step and (whole or not self.learns):
             return split_without_each(
                 problem.projection, None, problem.unexplained, owner, experiments
             )
@@ -518,7 +521,7 @@ class Estimate(AnyFit):
             else self._changes_of_free_run(free_run)
         )
         measure = Training() if split is None or split.measure is None else split.measure
-        if changes is None or not isinstance(measure, OF_ROWS) or self.model.form.bound is None:
+        if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
             return changes
         weighed = weigh_problem(measure, problem)
         values = times(weighed.unit, self.model.learner_at(weighed.points.x))
@@ -570,11 +573,9 @@ class Estimate(AnyFit):
         )
 
     def lines(self) -> list[str]:
-        baseline, bound, learner = self.problem.baseline, self.model.form.bound, "none"
-        if bound is not None:
-            learner = (
-                f"{bound.learner}, {bound.size} weights, {self.effective_weights:.1f} effective"
-            )
+        baseline, learner = self.problem.baseline, str(self.model.form.bound)
+        if self.learns:
+            learner += f", {self.effective_weights:.1f} effective"
         lines = [
             f"structure   {self.model.structure}",
             f"learner     {learner}",

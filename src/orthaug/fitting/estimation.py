@@ -33,7 +33,7 @@ from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
 from orthaug.inference.covariance import whitening_matrix
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Learner, Scaling
+from orthaug.models.learners import MLP, Learner, Scaling, declared, learns
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks, runs_on
@@ -43,6 +43,7 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.output_weights import by_covariance
 from orthaug.physics.problem import Problem, pose
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
+from orthaug.physics.systems import System
 
 _TURNS = 30
 _SETTLED = 1e-6  # relative change of W
@@ -111,11 +112,13 @@ def estimate(
     record: Record | Source, baseline: Baseline, **options: Unpack[Options]
 ) -> Estimate: ...
 @overload
-def estimate(record: Record, baseline: Motion, **options: Unpack[Options]) -> MotionEstimate: ...
+def estimate(
+    record: Record, baseline: Motion | System, **options: Unpack[Options]
+) -> MotionEstimate: ...
 @with_progress
 def estimate(
     record: Record | Source,
-    baseline: Baseline | Motion,
+    baseline: Baseline | Motion | System,
     *,
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
@@ -145,7 +148,8 @@ def estimate(
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
             where they are.
-        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`.
+        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`. A `System`, such
+            as `HammersteinWiener(order=2)`, writes a motion for the record.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
@@ -207,6 +211,10 @@ def estimate(
         "validation": validation,
         "progress": progress,
     }
+    if isinstance(baseline, System):
+        check_record(record, moves=True)
+        assert isinstance(record, Record)
+        baseline = baseline.motion(record)
     if isinstance(baseline, Motion):
         if lags is not None or initial is not None or ensemble:
             raise InputError(
@@ -231,7 +239,7 @@ def estimate(
         tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
     )
     learner = over_lags(learner, baseline, lags, *channels)
-    inputs = None if learner is None else learner.inputs
+    inputs = declared(learner).inputs
     if model is not None:
         inputs = tuple(str(entry) for entry in model.form.features.entries)
     _check_types(criterion=criterion)
@@ -282,6 +290,7 @@ def fit(
     """
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
+    learner = declared(learner)
     _check_splittable(structure, problem.baseline, learner)
     if criterion.automatic and _may_decide(
         problem, solver, structure, warm=initial is not None, ensemble=ensemble
@@ -315,7 +324,7 @@ def fit(
     choices = choose_regularizations(regularization, solver, criterion, structure, **given)
     auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
     restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
-    check_solver(solver, criterion, () if learner is None else choices)
+    check_solver(solver, criterion, choices if learns(learner) else ())
     engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
     warm, warnings = None, ()
     if initial is not None:
@@ -327,8 +336,9 @@ def fit(
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear
-    ensemble = _check_ensemble(ensemble and task.bound is not None, problem)
-    if task.bound is None and solved:
+    alone = not task.bound.learns
+    ensemble = _check_ensemble(ensemble and not alone, problem)
+    if alone and solved:
         estimate = _physics_alone(task, structure)
     else:
         # Not a worker's disk
@@ -338,7 +348,7 @@ def fit(
             validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved
         )
         estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
-        if _splits(structure) and estimate.status.ok and estimate.model.form.bound is not None:
+        if _splits(structure) and estimate.status.ok and estimate.learns:
             estimate = estimate.split(structure.measure)
     estimate = replace(estimate, warnings=(*warnings, *estimate.warnings))
     if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
@@ -356,7 +366,7 @@ def fit(
 def _refit_weights(problem: Problem, last: Estimate, **options: Any) -> Estimate:
     """Return the fit to other weights of the outputs, from the end of the last fit."""
     chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
-    start = None if last.model.form.bound is None else last.model
+    start = last.model if last.learns else None
     return fit(problem, initial=start, regularization=chosen, **options)
 
 
@@ -396,7 +406,7 @@ def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
 
 
 def _check_cost(
-    problem: Problem, learner: Learner | None, solver: Solver, runs: int, engine: Engine
+    problem: Problem, learner: Learner, solver: Solver, runs: int, engine: Engine
 ) -> None:
     """Raise InputError for a fit that would take more memory or time than there is."""
     sizes = {
@@ -439,9 +449,9 @@ def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
     return ensemble
 
 
-def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner | None) -> None:
+def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner) -> None:
     """Raise InputError for bounds on a θ that is split off after training."""
-    if not _splits(structure) or learner is None:
+    if not (_splits(structure) and learns(learner)):
         return
     bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
     if bounded:
@@ -469,7 +479,7 @@ def _warm_start(
         raise InputError(
             "`initial` is an ensemble, which has no single weights to start from; fit anew."
         )
-    if bound is None:
+    if not bound.learns:
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
         raise InputError(

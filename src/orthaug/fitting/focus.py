@@ -31,6 +31,7 @@ from orthaug.fitting.held_out import (
 )
 from orthaug.fitting.training import FOLD_ITERATIONS
 from orthaug.fitting.unfinished import NOT_CONVERGED
+from orthaug.models.learners import learns
 
 ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
@@ -84,7 +85,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
     wrong = _beside_physics(first, [problem.record], problem)
     if wrong is not None:
         return f"{wrong} over the training data"
-    if first.model.form.bound is not None:
+    if first.learns:
         validation = options["validation"]
         where = (
             "over the half of the rows that was held out"
@@ -190,7 +191,7 @@ class _FocusChoice:
     @property
     def learns(self) -> bool:
         """True where there is a learner to compare with physics alone."""
-        return self.options["learner"] is not None
+        return learns(self.options["learner"])
 
     @cached_property
     def free(self) -> Any:

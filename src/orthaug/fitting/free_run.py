@@ -248,7 +248,7 @@ class FreeRunTask(SimulationTask):
             loss = objective.evaluate(p, Start(states)).loss
             places.append(StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silent))
 
-        silenced = None if self.bound is None or self.warm is not None else self.bound.silent(w)
+        silenced = None if self.warm is not None else self.bound.silent(w)
         if self.physics is not None and silenced is not None:
             point = self.physics.end.point
             add(np.concatenate([point.theta, silenced]), point.states, silent=True)
@@ -256,7 +256,7 @@ class FreeRunTask(SimulationTask):
             add(np.concatenate([self.warm, w]))
         elif not places:
             add(objective.begin(w))
-        if self.bound is not None and plan.free_run.start_iterations and self.warm is None:
+        if plan.free_run.start_iterations and self.warm is None:
             steps = plan.free_run.start_iterations
             short = LevenbergMarquardt(steps, solver.tolerance, longest=steps)
             begun = objective.begin(

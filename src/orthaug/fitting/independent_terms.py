@@ -8,7 +8,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.regressors import Features
-from orthaug.models.learners import Learner
+from orthaug.models.learners import Learner, NoLearner, learns
 from orthaug.models.terms import Terms
 from orthaug.physics.problem import Problem
 
@@ -17,8 +17,8 @@ _NAMED = 6
 
 
 def independent_terms(
-    problem: Problem, learner: Learner | None
-) -> tuple[Problem, Learner | None, tuple[Warning, ...]]:
+    problem: Problem, learner: Learner
+) -> tuple[Problem, Learner, tuple[Warning, ...]]:
     """Return problem and learner without linearly dependent terms, and a warning.
 
     A term depends on the physics or on the terms before it, on these rows.
@@ -28,8 +28,8 @@ def independent_terms(
     Raises:
         InputError: more terms than rows can separate.
     """
-    if learner is None:
-        return replace(problem, features=Features(())), None, ()
+    if not learns(learner):
+        return replace(problem, features=Features(())), learner, ()
     if not isinstance(learner, Terms):
         return problem, learner, ()
     problem = problem.for_linear_learner()
@@ -55,7 +55,7 @@ def independent_terms(
     left = replace(
         problem, features=Features(tuple(problem.features.entries[i] for i in kept), linear=True)
     )
-    return left, learner.among([texts[i] for i in kept]) if kept else None, warnings
+    return left, learner.among([texts[i] for i in kept]) if kept else NoLearner(), warnings
 
 
 def _independent_columns(columns: np.ndarray, first: int) -> tuple[list[int], list[int]]:

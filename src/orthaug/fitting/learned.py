@@ -37,7 +37,7 @@ class ErrorStatistics(NamedTuple):
 class TrainedLearner:
     """A trained learner: its weights, and the results of its run."""
 
-    bound: Bound | None
+    bound: Bound
     weights: Vector
     scaling: Scaling
     unit: Vector
@@ -74,7 +74,7 @@ class Task(Protocol):
     def problem(self) -> Problem: ...
 
     @property
-    def bound(self) -> Bound | None: ...
+    def bound(self) -> Bound: ...
 
     @property
     def criterion(self) -> Criterion: ...

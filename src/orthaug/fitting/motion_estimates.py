@@ -237,7 +237,7 @@ class MotionEstimate(AnyFit):
         free_run = self.criterion.free_run
         assert free_run is not None, "a motion is trained on its free run"
         changes = self._changes_of_free_run(free_run)
-        if changes is None or self.model.form.bound is None:
+        if changes is None or not self.learns:
             return changes
         owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):
@@ -275,12 +275,16 @@ class MotionEstimate(AnyFit):
     def lines(self) -> list[str]:
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
         seen = ", ".join(str(entry) for entry in form.features)
-        learner = "none"
-        if bound is not None:
+        learner, split = str(bound), []
+        if self.learns:
             learner = (
                 f"{bound.learner} of {seen}, {bound.size} weights, "
                 f"{self.effective_weights:.1f} effective"
             )
+            split = [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
         lines = [
             f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
@@ -288,12 +292,8 @@ class MotionEstimate(AnyFit):
             f"learner     {learner}",
             f"data        {self.problem.record!r}",
             *self.status.lines,
+            *split,
         ]
-        if bound is not None:
-            lines += [
-                f"shared      {shared_in_words(self.shared)}",
-                f"measure     {self.split_by.name}",
-            ]
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
         lines += ["", *parameter_lines(motion.parameters, self.values, self.std, self.interval)]
@@ -322,7 +322,7 @@ def _with_split(
     warnings = [
         *of_measure,
         *_ill_conditioned(fit, split),
-        *_doubts(split, at_bound, unseen, fit.model.form.bound is not None),
+        *_doubts(split, at_bound, unseen, fit.learns),
     ]
     model = replace(
         fit.model,

@@ -34,7 +34,7 @@ from orthaug.fitting.training import Choice, plan_runs, train
 from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_converged, withheld
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
-from orthaug.models.learners import Learner, Scaling
+from orthaug.models.learners import Learner, Scaling, declared, learns
 from orthaug.models.motion_model import MotionModel, TrainedSegments
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.statistics import Statistics
@@ -58,7 +58,7 @@ def pose_for(
     """
     check_type(record, Record, "record", "a Record")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    return pose_motion(record, motion, None if learner is None else learner.inputs, output_weights)
+    return pose_motion(record, motion, declared(learner).inputs, output_weights)
 
 
 def fit_motion(
@@ -83,6 +83,7 @@ def fit_motion(
     Raises:
         InputError: what a motion cannot be trained with.
     """
+    learner = declared(learner)
     criterion = DEFAULT if criterion.automatic else criterion
     criterion = criterion.on(problem.record)
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
@@ -92,7 +93,7 @@ def fit_motion(
         regularization, solver, criterion, structure, learner=learner, **conditions
     )
     restarts, seed = checked_starts(restarts, seed, warm=False, ensemble=False)
-    check_solver(solver, criterion, () if learner is None else choices)
+    check_solver(solver, criterion, choices if learns(learner) else ())
     engine = runs_on(engine) if restarts * len(choices) > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
     task = MotionTask.of(problem, learner, criterion, engine).with_checkpoints(kept)
@@ -132,7 +133,9 @@ def conclude_motion(
     layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
     trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
     model = replace(_model(plan, structure, learned), trained=trained)
-    reason = ALONE.get(learned.ending, "") if learned.bound is None or task.physics is None else ""
+    reason = (
+        ALONE.get(learned.ending, "") if not learned.bound.learns or task.physics is None else ""
+    )
     if reason and not learned.ending.usable and (where := task.problem.without_value(np.any)):
         reason = f"{where}; correct it, or bound its parameters"
     silent = learner_silent(learned, _learner_values(plan, learned))
@@ -170,7 +173,7 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
     None of others.
     """
     bound = plan.bound
-    if bound is None or learned.scores is None or not is_silenced(learned.effective, bound.ny):
+    if learned.scores is None or not is_silenced(learned.effective, bound.ny):
         return None
     assert learned.coefficients is not None
     x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
@@ -210,7 +213,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     model = replace(model, window=_best_window(model, record))
     return (
         model
-        if model.form.bound is None
+        if not model.learns
         else _with_limits(replace(model, seen=_feature_range(model, record)), record)
     )
 
@@ -290,12 +293,9 @@ def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
     problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
     criterion = Simulation(kept.segment, kept.washout)
     segmented = SegmentedMotion.of(problem, form.bound, criterion).with_substeps(form.substeps)
-    centre, half = (
-        (numbers.centre, numbers.halfwidth) if form.bound is not None else (np.zeros(0), np.ones(0))
-    )
     segmented = replace(
         segmented,
-        scaling=Scaling(np.asarray(centre), np.asarray(half)),
+        scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
         unit=np.asarray(numbers.gain),
     )
     if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(

@@ -14,7 +14,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field, rest_of
-from orthaug.inference.splitting import SUPPORTED
+from orthaug.inference.splitting import warn_beyond_data
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 
@@ -51,13 +51,7 @@ def field_under(
     finite = np.isfinite(found).all(axis=0)
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
-    warnings = ()
-    if share < SUPPORTED and form.bound is not None:
-        text = (
-            f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-            "training data: elsewhere the parameters depend on the learner's extrapolation."
-        )
-        warnings = (Warning("measure_beyond_data", text),)
+    warnings = warn_beyond_data(measure, share, form, "the parameters depend")
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 

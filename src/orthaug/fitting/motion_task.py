@@ -28,7 +28,7 @@ from orthaug.fitting.simulation_task import SimulationTask, StartPoint
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Bound, Learner
+from orthaug.models.learners import Bound, Learner, declared, learns
 from orthaug.models.rows import Engine
 from orthaug.models.settling import LOOSE
 from orthaug.models.terms import scaling_of
@@ -198,12 +198,9 @@ class MotionTask(SimulationTask):
         Raises:
             InputError: nothing would be scored.
         """
-        states, outputs = problem.motion.learned
-        bound = (
-            None
-            if learner is None
-            else Bound(learner, len(problem.features), len(states) + len(outputs))
-        )
+        learner = declared(learner)
+        learned = sum(map(len, problem.motion.learned)) if learns(learner) else 0
+        bound = Bound.of(learner, len(problem.features), learned)
         return cls(
             SegmentedMotion.of(
                 problem, bound, criterion, sums=None if engine is None else SegmentSums.of(engine)
@@ -233,7 +230,7 @@ class MotionTask(SimulationTask):
         unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
         initial = self.problem.motion.coordinates.initial
         nothing: dict[str, Any] = {
-            "bound": None,
+            "bound": alone.bound,
             "weights": np.zeros(0),
             "errors": unknown,
             "coefficients": initial,
@@ -269,7 +266,7 @@ class MotionTask(SimulationTask):
 
         Over the runs of physics alone.
         """
-        if plan.bound is None:
+        if not plan.bound.learns:
             return plan
         point = physics.end.point
         x, u = (part.T for part in plan.physics_only.trajectory(point.c, (), point.states))
@@ -293,8 +290,7 @@ class MotionTask(SimulationTask):
 
         A learner that cannot be silenced starts as it is.
         """
-        # No learner: physics alone had no finite run
-        silenced = w if self.bound is None else self.bound.silent(w)
+        silenced = self.bound.silent(w)
         q = (
             self.problem.motion.coordinates.initial
             if self.physics is None

@@ -28,7 +28,7 @@ from orthaug.fitting.solvers.limit import noticeable_in
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
 from orthaug.fitting.training_rows import TrainingRows
 from orthaug.fitting.unfinished import noticeable_fall
-from orthaug.models.learners import Bound, Learner, Scaling
+from orthaug.models.learners import Bound, Learner, Scaling, nothing_learned
 from orthaug.models.rows import Engine, InMemory, Overlap
 from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
@@ -67,19 +67,14 @@ class OneStepTask(TrainingRows):
 
         Unless both scalings are given.
         """
-        bound = (
-            None
-            if learner is None
-            else Bound(learner, len(problem.features.entries), len(problem.outputs))
-        )
-        if isinstance(problem, StreamedProblem):
-            z = problem.feature_range if bound else np.zeros((2, 0))
-        else:
-            z = problem.feature_rows() if bound else np.zeros((problem.count, 0))
-        whitened, spread = problem.unexplained_sizes(centred=bound is not None)
+        bound = Bound.of(learner, len(problem.features.entries), len(problem.outputs))
+        learns = bound.learns
+        streamed = isinstance(problem, StreamedProblem)
+        z = problem.feature_range if streamed else problem.feature_rows()
+        whitened, spread = problem.unexplained_sizes(centred=learns)
         rms = float(np.sqrt(np.mean(whitened**2)))
-        scaling = scaling_of(learner, z) if scaling is None else scaling
-        unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit) * (bound is not None)
+        scaling = scaling_of(bound.learner, z) if scaling is None else scaling
+        unit = np.asarray(OUTPUT_UNIT * spread if unit is None else unit) * learns
         gain = problem.weight.matrix * unit / rms
         if isinstance(problem, StreamedProblem):
             row_builder = problem.row_builder(scaling.centre, scaling.halfwidth, rms, gain)
@@ -120,9 +115,9 @@ class OneStepTask(TrainingRows):
             replace(self.problem, features=Features(())),
             Scaling(np.zeros(0), np.ones(0)),
         )
-        return replace(
-            self, problem=problem, bound=None, scaling=scaling, unit=np.zeros_like(self.unit)
-        )
+        bound = nothing_learned(len(problem.outputs))
+        unit = np.zeros_like(self.unit)
+        return replace(self, problem=problem, bound=bound, scaling=scaling, unit=unit)
 
     def physics_alone(self) -> tuple[OneStepTask, TrainedLearner]:
         """Return the task without a learner, and least squares on its rows."""
@@ -130,9 +125,7 @@ class OneStepTask(TrainingRows):
 
     def on(self, record: Record) -> OneStepTask:
         """Return the task on another record."""
-        return OneStepTask.of(
-            self.problem.on(record), self.bound and self.bound.learner, engine=self.engine
-        )
+        return OneStepTask.of(self.problem.on(record), self.bound.learner, engine=self.engine)
 
     def prepare(
         self, solver: Any, structure: Structure, progress: RunProgress = quiet
@@ -146,7 +139,7 @@ class OneStepTask(TrainingRows):
         theta = elimination.theta(nothing, elimination.active(nothing))
         missed = problem.target_coordinates - problem.projection.to_coordinates @ theta
         loss = float(problem.unexplained_moments.square + missed @ missed) / problem.samples
-        begins = self.bound is not None and solver.gauss_newton and not structure.from_initial
+        begins = self.bound.learns and solver.gauss_newton and not structure.from_initial
         few = self._train_on_subsample() if begins and problem.count >= MANY_ROWS else None
         return replace(self, physics_loss=loss, few=few and few.prepare(solver, structure))
 
@@ -155,7 +148,6 @@ class OneStepTask(TrainingRows):
 
         None where it lacks what the physics needs.
         """
-        assert self.bound is not None
         problem = self.problem
         source = (
             problem.source
@@ -199,7 +191,7 @@ class OneStepTask(TrainingRows):
         ):
             return run
         # Its runs end below physics alone
-        silent = self.bound.silent(np.asarray(w)) if self.bound else None
+        silent = self.bound.silent(np.asarray(w))
         w = w if silent is None else jnp.asarray(silent)
         run = self._run_inside(solver, w, structure, elimination, regularization, progress)
         if (
@@ -263,7 +255,6 @@ class OneStepTask(TrainingRows):
         regularization: str | float,
         progress: RunProgress,
     ) -> compiled.TrainingRun:
-        assert self.bound is not None, "physics alone is not trained one step ahead"
         matrix, target = elimination.hold(fixed)
         hold = Hold(matrix, target / self.rms)
         ridge, evidence = ridge_of(regularization)
@@ -302,7 +293,6 @@ class OneStepTask(TrainingRows):
         self, solver: Any, w: Any, physics: Physics, progress: RunProgress
     ) -> GradientRun:
         """Run Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
-        assert self.bound is not None
         nt = len(physics.outputs)
         nothing = Overlap(np.zeros((nt, nt + self.bound.size)), np.zeros(nt))
         unknowns = np.concatenate([np.zeros(nt), w])
@@ -317,7 +307,6 @@ class OneStepTask(TrainingRows):
         self, solver: Any, w: Any, hold: Hold, options: dict[str, Any]
     ) -> compiled.TrainingRun:
         """Run Levenberg-Marquardt, compiled whole for rows in memory, else driven by the host."""
-        assert self.bound is not None
         samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
@@ -355,7 +344,7 @@ class OneStepTask(TrainingRows):
         change = self.problem.projection.to_coordinates
         none = np.zeros(0)
         return TrainedLearner(
-            bound=None,
+            bound=nothing_learned(len(self.problem.outputs)),
             weights=none,
             scaling=self.scaling,
             unit=self.unit,
@@ -399,7 +388,6 @@ class OneStepTask(TrainingRows):
         if run.held:
             nt = len(normal.overlap.values)
             free = Hold(np.zeros((nt, nt)), np.zeros(nt))
-            assert self.bound is not None
             normal = SummedOneStep(self.engine, self.bound, self.rows, free)(
                 np.asarray(run.w), normal.overlap
             )

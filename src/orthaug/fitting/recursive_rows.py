@@ -44,7 +44,7 @@ def _evaluate(
         known = form.baseline.known(row, form.layout, form.outputs, jnp)
         added = known + form.at(numbers, row).learner
         reach = jnp.zeros_like(added)
-        if form.bound is not None and form.differentiable:
+        if form.differentiable:
             z = (form.features.evaluate(row, form.layout, jnp) - numbers.centre) / numbers.halfwidth
             reach = reach + jnp.max(jnp.abs(z), initial=0.0)
         return jnp.concatenate([phi, added[:, None], reach[:, None]], axis=1)

@@ -13,7 +13,7 @@ from orthaug._base.memory import check_limit, check_memory, in_words
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS, Solver
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Learner
+from orthaug.models.learners import Learner, learns
 from orthaug.models.rows import Room
 from orthaug.physics.motion import Motion
 
@@ -146,7 +146,7 @@ def check_motion_choices(
 ) -> None:
     """Raise InputError for choices that a motion cannot be trained with."""
     states, outputs = motion.learned
-    if learner is not None and not (states or outputs):
+    if learns(learner) and not (states or outputs):
         raise KeyedError(
             "there is a learner, but no state and no output of the motion is learned; set "
             "`learned` where it is added.",

@@ -90,7 +90,7 @@ class SegmentedLagged(SegmentedProblem):
         return self.task.problem
 
     @property
-    def bound(self) -> Bound | None:
+    def bound(self) -> Bound:
         return self.task.bound
 
     @cached_property
@@ -120,7 +120,7 @@ class SegmentedLagged(SegmentedProblem):
         """Return the criterion as a function of θ and the weights."""
         start, elimination = np.asarray(self.segments.start), eliminate(structure, self.problem)
         # The unknown is c
-        free = elimination.projects and not elimination.bounded and self.bound is not None
+        free = elimination.projects and not elimination.bounded
         bounds = elimination.lower.copy(), elimination.upper.copy()
         for i, value in self.fixed.items():
             bounds[0][i] = bounds[1][i] = value
@@ -157,11 +157,14 @@ class StructuredObjective(FreeRunObjective):
     fixed: Fixed
 
     @property
+    def splits(self) -> bool:
+        """True where θ is split from a learner."""
+        return self.elimination.projects and self.task.bound.learns
+
+    @property
     def follows(self) -> bool:
         """True where c follows θ, `c = θ − θ_aux(w)`."""
-        return (
-            self.elimination.projects and self.elimination.bounded and self.task.bound is not None
-        )
+        return self.splits and self.elimination.bounded
 
     @property
     def apart(self) -> bool:
@@ -215,7 +218,7 @@ class StructuredObjective(FreeRunObjective):
 
         That of an orthogonal θ is without the learner's share.
         """
-        if not (self.elimination.projects and self.task.bound is not None):
+        if not self.splits:
             return linear.information
         change = self.change(w)
         return change.T @ linear.information @ change

@@ -53,7 +53,7 @@ class SegmentedMotion(SegmentedProblem):
     def of(
         cls,
         problem: MotionProblem,
-        bound: Bound | None,
+        bound: Bound,
         criterion: Criterion,
         like: SegmentedMotion | None = None,
         sums: SegmentSums | None = None,
@@ -67,10 +67,9 @@ class SegmentedMotion(SegmentedProblem):
         """
         record, free_run = problem.record, criterion.free_run
         assert free_run is not None, "a motion has no criterion one step ahead"
-        features = () if bound is None else problem.features
+        features = problem.features[: bound.nz]  # none without a learner
         substeps = problem.substeps if like is None else like.dynamics.substeps
         dynamics = MotionDynamics(problem.motion, features, bound, record.sampling_time, substeps)
-        nz, nl = len(features), 0 if bound is None else bound.ny
         shares = 1 if sums is None else sums.engine.shares
         return cls(
             record=record,
@@ -81,15 +80,15 @@ class SegmentedMotion(SegmentedProblem):
             rms=1.0,
             deviation=problem.deviation,
             output_weights=problem.weight.choice,
-            scaling=Scaling(np.zeros(nz), np.ones(nz)),
-            unit=np.ones(nl),
+            scaling=Scaling(np.zeros(bound.nz), np.ones(bound.nz)),
+            unit=np.ones(bound.ny),
             sums=sums,
             problem=problem,
             loose=LOOSE * sizes(problem),
         )
 
     @property
-    def bound(self) -> Bound | None:
+    def bound(self) -> Bound:
         return self.dynamics.bound
 
     @property

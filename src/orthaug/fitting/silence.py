@@ -109,12 +109,7 @@ def learner_silent(learned: TrainedLearner, values: Matrix | None = None) -> lis
         values: of the learner (N, ny) over the training rows, where they are known.
     """
     bound = learned.bound
-    if (
-        bound is None
-        or not learned.ending.usable
-        or learned.ending is Ending.SPANNED
-        or not bound.size
-    ):
+    if not learned.ending.usable or learned.ending is Ending.SPANNED or not bound.size:
         return []
     if learned.effective < _SILENT or (values is not None and not values.any()):
         does = "the learner contributes nothing: the fit is that of physics alone"

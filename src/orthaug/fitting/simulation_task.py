@@ -118,7 +118,7 @@ class SimulationTask(ABC):
         return self.plan.problem
 
     @property
-    def bound(self) -> Bound | None:
+    def bound(self) -> Bound:
         return self.plan.bound
 
     @property
@@ -165,7 +165,7 @@ class SimulationTask(ABC):
         cannot be silenced starts with its weights, from the best θ for them.
         """
         plan, physics = self.plan, self.physics
-        if self.bound is None and physics is not None:
+        if not self.bound.learns and physics is not None:
             return physics
         objective, w = plan.objective(structure), np.asarray(w)
         ridge, evidence = ridge_of(regularization)

@@ -51,11 +51,9 @@ class PlannedRun(NamedTuple):
     regularization: str | float
 
 
-def plan_runs(
-    bound: Bound | None, seeds: range, choices: Sequence[str | float]
-) -> list[PlannedRun]:
+def plan_runs(bound: Bound, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
     """Return a run from every seed with every regularization; one without a learner."""
-    if bound is None:
+    if not bound.learns:
         return [PlannedRun(seeds.start, np.zeros(0), "none")]
     keyed = {seed: bound.init(jax.random.key(seed)) for seed in seeds}
     return [PlannedRun(seed, w, choice) for choice in choices for seed, w in keyed.items()]
@@ -90,7 +88,7 @@ class Choice:
         They can where runs are finite, or regularizations are several.
         """
         several = len({start.regularization for start in starts}) > 1
-        return task.bound is not None and (
+        return task.bound.learns and (
             task.criterion.free_run is not None or (several and not self.scored)
         )
 
@@ -194,7 +192,7 @@ def _physics_to_compare(conclude: Concluding, task: Task, structure: Structure) 
     streamed = hasattr(task.problem, "source")
     return (
         None
-        if task.bound is None or streamed
+        if not task.bound.learns or streamed
         else _physics_for_comparison(conclude, task, structure)
     )
 
@@ -246,7 +244,7 @@ def _run_all(
     The latter only where held-out rows can choose.
     """
     begun, runs = _run(task, starts, structure, solver, progress, runner)
-    if task.bound is None or not choice.retry or (choice.validation is None and not choice.blocks):
+    if not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
     def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
@@ -272,9 +270,7 @@ def _run(
         figures = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
         LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *figures)
     failed = [start for start, run in zip(made, runs, strict=True) if not run.ending.usable]
-    if (
-        task.bound is None or not failed or len(failed) == len(made)
-    ):  # where all fail the data or the learner are bad
+    if not failed or len(failed) == len(made):  # where all fail the data or the learner are bad
         return made, runs
     following = max(start.seed for start in made) + 1
     bound = task.bound

@@ -12,7 +12,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.inference.covariance import mixing_matrix
-from orthaug.models.learners import Bound, Scaling
+from orthaug.models.learners import Bound, Scaling, nothing_learned
 from orthaug.models.rows import (
     Engine,
     LearnerSums,
@@ -38,14 +38,14 @@ class Share(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TrainingRows:
-    """A problem with its learner (None for physics alone), scaled for training.
+    """A problem with its learner, scaled for training.
 
     `unit` (ny,) is the learner's output unit in the outputs' units. `rms` is the RMS of the
     baseline's whitened residual, the unit of the criterion's rows. The engine keeps these rows.
     """
 
     problem: Problem
-    bound: Bound | None
+    bound: Bound
     scaling: Scaling
     unit: Vector
     rms: float
@@ -55,7 +55,7 @@ class TrainingRows:
     @property
     def _no_overlap(self) -> Overlap:
         """The overlap before any pass."""
-        nt, size = len(self.problem.baseline.names), self.bound.size if self.bound else 0
+        nt, size = len(self.problem.baseline.names), self.bound.size
         return Overlap(np.zeros((nt, size)), np.zeros(nt))
 
     def mean_square(self, loss: Any) -> float:
@@ -68,7 +68,7 @@ class TrainingRows:
     def share(self, learned: TrainedLearner) -> Share:
         """Return QᵀF, refined once, and ‖F‖²; not finite where the learner is not."""
         f = np.zeros(len(self.problem.baseline.names))
-        if learned.bound is None:
+        if not learned.bound.learns:
             return Share(f, 0.0)
         for _ in range(2):
             rest, square = self._sums(learned, f)
@@ -95,7 +95,7 @@ class TrainingRows:
 
     def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
         """Return f at the training rows in memory, in the outputs' units."""
-        if self.bound is None:
+        if not self.bound.learns:  # nothing to compile
             return np.zeros_like(self.problem.target)
         return (
             from_chunks(row_values(self.bound, w, self.rows.z), len(self.problem.rows)) * self.unit
@@ -113,8 +113,6 @@ class TrainingRows:
     def share_slope(self, w: Vector) -> Matrix:
         """Return QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""
         nt = len(self.problem.baseline.names)
-        if self.bound is None:
-            return np.zeros((nt, 0))
         total = self.engine.sum(Blocks(self.bound), self.rows, w, self._no_overlap)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
@@ -140,5 +138,7 @@ class TrainingRows:
     def physics_middle(self, noise: Matrix) -> Matrix:
         """Return ΣqᵀΣ_eq (nθ, nθ) of the rows q of Q, for whitened noise covariance."""
         return np.asarray(
-            self.engine.sum(MixedGram(None), self.rows, np.zeros(0), mixing_matrix(noise))
+            self.engine.sum(
+                MixedGram(nothing_learned(len(noise))), self.rows, np.zeros(0), mixing_matrix(noise)
+            )
         )

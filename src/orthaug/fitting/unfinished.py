@@ -67,7 +67,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
     )
     if learned.ending is Ending.STOPPED:
         return Warning(NOT_CONVERGED, f"{text}Train to the end.")
-    if learned.bound is None:
+    if not learned.bound.learns:
         text += (
             "Give initial values nearer to the data, fix what the data do not determine, or "
             "allow more `iterations`"

@@ -254,13 +254,12 @@ def _slopes_along(
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
     phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
-    if form.bound is not None:
-        z = form.features.evaluate(rows.T, form.layout, jnp)
-        z = ((z - numbers.centre) / numbers.halfwidth).T
-        gain = jnp.broadcast_to(
-            jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1])
-        )
-        columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
+    z = form.features.evaluate(rows.T, form.layout, jnp)
+    z = ((z - numbers.centre) / numbers.halfwidth).T
+    gain = jnp.broadcast_to(
+        jnp.diag(numbers.gain)[..., None], (*2 * (len(form.outputs),), rows.shape[-1])
+    )
+    columns = jnp.concatenate([columns, form.bound.jacobian(numbers.weights, z, gain)[1]])
     return jnp.einsum("nom,nr->rom", columns, root)
 
 

@@ -45,7 +45,7 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
     Empty where the learner is no sum of terms.
     """
     form, numbers, statistics = model.form, model.numbers, model.statistics
-    if form.bound is None or not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
+    if not isinstance(form.bound.learner, Terms) or numbers.tilt is not None:
         return ()
     places, features = _targets(model), _features(model)
     scale = np.asarray(numbers.gain)[:, None] / np.asarray(numbers.halfwidth)[None, :]
@@ -87,7 +87,7 @@ def equation(model: Any, writing: str = "text") -> str:
     check_choice(writing, WRITINGS, "`writing`")
     form = model.form
     terms = learned_terms(model)
-    if form.bound is not None and not terms:
+    if form.learns and not terms:
         raise InputError(
             "only a learner of terms can be written as an equation; `explain` finds terms for "
             "another."

@@ -98,7 +98,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     names, motion = form.motion.names, form.motion
     if not learned_places(motion):
         return SharedDirections(names, np.zeros((len(names), 0)))
-    if form.bound is not None and getattr(form.bound.learner, "linear", False):
+    if form.bound.linear:
         return _spanned_directions(form, q, x, u)
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
@@ -241,7 +241,7 @@ def split_motion(
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
     c = np.asarray(numbers.theta - numbers.theta_aux)
-    if form.bound is None:
+    if not form.learns:
         nothing = SharedDirections(form.motion.names, np.zeros((count, 0)))
         return MotionSplit(name, c, nothing, np.eye(count), None, None, 1.0, field)
     q, shared = nearest(form, numbers, start, field, bounds, basis)

@@ -7,6 +7,7 @@ measure θ depends on the learner, and shares its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from orthaug.physics.output_weights import times
 from orthaug.physics.projection import Projection
 from orthaug.physics.streamed import RowBuilder, StreamedProblem
 
-SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
+_SUPPORTED = 0.9  # share of a measure within reach of the data, below which it is warned of
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,20 +102,28 @@ def split_by_measure(
     left = projection.along(model.shared) @ projection.coordinates(rest)
     defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    reach = (
-        f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-        "training data"
-    )
-    learns = form.bound is not None
-    warning = Warning(
-        "measure_beyond_data", f"{reach}: elsewhere θ depends on the learner's extrapolation."
-    )
-    warnings = (warning,) if share < SUPPORTED and learns else ()
+    warnings = warn_beyond_data(measure, share, form, "θ depends")
     condition = weighed.excitation.condition
     of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
         measure.name, theta, aux, covariance, defect, *of_measure, slope=slope, measure=measure
     )
+
+
+def warn_beyond_data(measure: Measure, share: float, form: Any, what: str) -> tuple[Warning, ...]:
+    """Return the warning that a learner extrapolates over most of a measure, or none.
+
+    Args:
+        share: of the measure within reach of the training data.
+        what: what depends on the learner there, with its verb.
+    """
+    if share >= _SUPPORTED or not form.learns:
+        return ()
+    text = (
+        f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
+        f"training data: elsewhere {what} on the learner's extrapolation."
+    )
+    return (Warning("measure_beyond_data", text),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +144,7 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
     """Return ∂θ_aux/∂w under the training measure, in one pass over all rows of a source."""
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
-    if bound is None or not bound.size:
+    if not bound.size:
         return np.zeros((nt, 0))
     gain = problem.weight.matrix * np.asarray(numbers.gain)
     row_builder = problem.row_builder(
@@ -156,7 +165,7 @@ def learner_slope(model: Model, points: Points, projection: Projection, unit: np
     """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
-    if bound is None or not bound.size:
+    if not bound.size:
         return np.zeros((nt, 0))
     engine = InMemory()
     rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)

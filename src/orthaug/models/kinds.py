@@ -6,10 +6,10 @@ A new one is a file with its declaration, and an entry here.
 from __future__ import annotations
 
 from orthaug._base.registry import Registry
-from orthaug.models.learners import MLP, PhysicsAlone
+from orthaug.models.learners import MLP, NoLearner
 from orthaug.models.terms import Terms
 
 LEARNERS = Registry(
-    "learner", {"mlp": MLP, "terms": Terms, "none": PhysicsAlone}, reserved=("kind", "nz", "ny")
+    "learner", {"mlp": MLP, "terms": Terms, "none": NoLearner}, reserved=("kind", "nz", "ny")
 )
 """`nz` and `ny` are saved next to a learner's own fields."""

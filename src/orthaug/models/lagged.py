@@ -23,7 +23,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
 from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers, Parts
-from orthaug.models.learners import Bound
+from orthaug.models.learners import Bound, nothing_learned
 from orthaug.physics.baseline import Baseline
 
 
@@ -35,12 +35,17 @@ class LaggedDynamics:
     features: Features
     layout: Layout
     outputs: tuple[str, ...]
-    bound: Bound | None
+    bound: Bound
 
     @property
     def physics_only(self) -> LaggedDynamics:
         """These dynamics without the learner."""
-        return replace(self, features=Features(()), bound=None)
+        return replace(self, features=Features(()), bound=nothing_learned(len(self.outputs)))
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.bound.learns
 
     @property
     def linear(self) -> bool:
@@ -49,11 +54,11 @@ class LaggedDynamics:
     @property
     def beyond(self) -> str:
         """Behaviour of the learner's correction beyond its training range."""
-        return "free" if self.bound is None else beyond_of(self.bound.learner, "hold")
+        return beyond_of(self.bound.learner, "hold")
 
     @property
     def differentiable(self) -> bool:
-        return self.bound is None or self.bound.differentiable
+        return self.bound.differentiable
 
     @property
     def first_row(self) -> int:
@@ -65,7 +70,7 @@ class LaggedDynamics:
 
     @property
     def unknowns(self) -> int:
-        return len(self.baseline.names) + (self.bound.size if self.bound else 0)
+        return len(self.baseline.names) + self.bound.size
 
     @property
     def fed_back(self) -> tuple[tuple[int, int], ...]:
@@ -125,7 +130,7 @@ class LaggedDynamics:
         None without a learner, and of a function from another toolbox, whose features are not
         scaled.
         """
-        if self.bound is None or not self.bound.differentiable:
+        if not (self.learns and self.differentiable):
             return None
         before = start.reshape(self.memory, len(self.outputs))[::-1]
         states = self.start(
@@ -159,9 +164,6 @@ class LaggedDynamics:
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         physics = known + phi @ numbers.theta
-        if self.bound is None:
-            raw = jnp.zeros(len(self.outputs))
-            return Parts(physics, raw - phi @ numbers.theta_aux, raw)
         z = self.features.evaluate(x, self.layout, jnp)
         share: Any = 1.0
         if numbers.limits is not None:
@@ -207,7 +209,7 @@ class LaggedDynamics:
 
     def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
         """Return the value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ (ny, lags) of every fed-back lag."""
-        leaves = [] if self.bound is None else self.bound.leaves(numbers.weights)
+        leaves = self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
         def predict(c: Any, leaves: list[Any], past: Any) -> Any:

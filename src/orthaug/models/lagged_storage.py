@@ -71,12 +71,14 @@ def rebuild(
         baseline = replace(
             baseline, parameters=tuple(Parameter(**p) for p in physics["parameters"])
         )
-    bound = bound_of(declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path)
-    entries = tuple(
-        Expression(e["text"], tuple(e["constants"].items())) for e in declared["features"]
-    )
-    features = Features(entries, bound is not None and getattr(bound.learner, "linear", False))
     names = tuple(channel["name"] for channel in declared["outputs"])
+    weights = arrays.get("numbers.weights", np.zeros(0))
+    bound = bound_of(declared["learner"], weights, learner, len(names), path)
+    entries = tuple(
+        Expression(e["text"], tuple(e["constants"].items()))
+        for e in declared["features"][: bound.nz]
+    )
+    features = Features(entries, bound.linear)
     form = LaggedDynamics(
         baseline, features, tuple(Lag(*lag) for lag in declared["layout"]), names, bound
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -193,11 +193,30 @@ def _draw_uniform(key: Array, reach: Float[Array, "r"], count: int) -> Float[Arr
 
 
 @dataclass(frozen=True)
-class PhysicsAlone:
-    """Declaration that nothing is learned: `kind = "none"` in a spec, None in Python."""
+class NoLearner:
+    """A learner with no weights, of no features, that adds zeros: physics alone.
+
+    It is `kind = "none"` in a spec, None in Python.
+    """
+
+    inputs = None
+    beyond = "free"
+
+    def __repr__(self) -> str:
+        return "none"
 
     def resolve(self, context: Any) -> None:
         return None
+
+    def silent(self, tree: Tree) -> Tree:
+        return tree
+
+    def init(self, key: Array, nz: int, ny: int) -> Tree:
+        """Return a matrix without columns: the outputs are the rows, and there are no weights."""
+        return np.zeros((ny, 0))
+
+    def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        return jnp.zeros(tree.shape[0])
 
 
 @dataclass(frozen=True)
@@ -339,6 +358,11 @@ class Bound:
     ny: int
     _shape: tuple[Any, ...] = field(init=False, repr=False, compare=False)
 
+    @classmethod
+    def of(cls, learner: Learner | None, nz: int, ny: int) -> Bound:
+        """Return a learner with its numbers; `NoLearner` sees no features."""
+        return cls(declared(learner), nz, ny) if learns(learner) else nothing_learned(ny)
+
     def __post_init__(self) -> None:
         tree = jax.eval_shape(lambda: self.learner.init(jax.random.key(0), self.nz, self.ny))
         leaves, treedef = jax.tree.flatten(tree)
@@ -355,6 +379,19 @@ class Bound:
                 f"the learner returned shape {getattr(out, 'shape', type(out).__name__)} for "
                 f"one row; expected (ny,) = ({self.ny},)."
             )
+
+    def __str__(self) -> str:
+        return f"{self.learner}, {self.size} weights" if self.learns else "none"
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return learns(self.learner)
+
+    @property
+    def linear(self) -> bool:
+        """True for a linear combination of the features."""
+        return getattr(self.learner, "linear", False)
 
     @property
     def differentiable(self) -> bool:
@@ -473,3 +510,19 @@ def _probe(
     return bound.jacobian(
         w, z, jnp.broadcast_to(jnp.eye(bound.ny)[..., None], (bound.ny, bound.ny, _PROBES))
     )
+
+
+def declared(learner: Learner | None) -> Learner:
+    """Return a learner itself, and `NoLearner` for None."""
+    return NoLearner() if learner is None else learner
+
+
+def learns(learner: Learner | None) -> bool:
+    """Return False for physics alone."""
+    return not isinstance(learner, NoLearner | None)
+
+
+@cache
+def nothing_learned(ny: int = 0) -> Bound:
+    """Return `NoLearner` with its number of outputs, which are zero."""
+    return Bound(NoLearner(), 0, ny)

@@ -103,10 +103,9 @@ class Model(RecordModel, NotebookView):
     """Preparation of the training data."""
 
     def __repr__(self) -> str:
-        learner = self.form.bound.learner if self.form.bound else "none"
         return (
             f"Model({self.structure}, θ: {', '.join(self.form.baseline.names) or 'none'}, "
-            f"learner: {learner})"
+            f"learner: {self.form.bound.learner})"
         )
 
     @property

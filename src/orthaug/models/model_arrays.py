@@ -16,7 +16,7 @@ from orthaug._base.registry import freeze
 from orthaug.data.record import Channel, Preparation
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
-from orthaug.models.learners import Bound, Learner
+from orthaug.models.learners import Bound, Learner, nothing_learned
 from orthaug.models.statistics import Statistics
 
 _SAID = ("structure", "measure", "sampling_time", "time_column")
@@ -89,9 +89,9 @@ def statistics_from(arrays: dict[str, np.ndarray], declared: dict[str, Any]) -> 
     )
 
 
-def declaration_of(bound: Bound | None) -> dict[str, Any] | None:
+def declaration_of(bound: Bound) -> dict[str, Any] | None:
     """Return the declaration of a learner; None without one."""
-    if bound is None:
+    if not bound.learns:
         return None
     return declare_learner(bound.learner) | {"nz": bound.nz, "ny": bound.ny}
 
@@ -132,15 +132,22 @@ def _field_names(learner: type) -> list[str]:
 
 
 def bound_of(
-    kept: dict[str, Any] | None, weights: np.ndarray, given: Learner | None, path: Path
-) -> Bound | None:
-    """Return the learner that a file declares with its sizes; None for physics alone.
+    kept: dict[str, Any] | None,
+    weights: np.ndarray,
+    given: Learner | None,
+    outputs: int,
+    path: Path,
+) -> Bound:
+    """Return the learner that a file declares with its sizes.
+
+    Args:
+        outputs: to which nothing is added where the file declares no learner.
 
     Raises:
         InputError: a learner that is not known here, or has another number of weights.
     """
     if kept is None:
-        return None
+        return nothing_learned(outputs)
     bound = Bound(rebuilt_learner(kept, given, path), kept["nz"], kept["ny"])
     saved = weights.shape[-1]
     if bound.size != saved:

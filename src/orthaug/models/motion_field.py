@@ -34,7 +34,7 @@ class MotionField:
 
     motion: Motion
     features: tuple[Expression, ...]
-    bound: Bound | None
+    bound: Bound
     sampling_time: float
     substeps: int
 
@@ -43,8 +43,18 @@ class MotionField:
         return len(self.motion.states)
 
     @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.bound.learns
+
+    @property
+    def corrected(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """States and outputs whose equations the learner is added to."""
+        return self.motion.learned if self.learns else ((), ())
+
+    @property
     def unknowns(self) -> int:
-        return len(self.motion.parameters) + (self.bound.size if self.bound else 0)
+        return len(self.motion.parameters) + self.bound.size
 
     def now(self, inputs: Any) -> Any:
         """Return u (…, nu) at the sample itself, of the rows that steps read."""
@@ -54,7 +64,8 @@ class MotionField:
         """Return the learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
         values: Mapping[str, Any] = self.motion.values(x, u, self.motion.initial, xp)
         columns = [xp.asarray(entry.value(values, xp), dtype=float) for entry in self.features]
-        return xp.stack([xp.broadcast_to(column, x.shape[1:]) for column in columns])
+        rows = [xp.broadcast_to(column, (1, *x.shape[1:])) for column in columns]
+        return xp.concatenate([xp.zeros((0, *x.shape[1:])), *rows])
 
     def learned(self, numbers: Numbers, x: Any, u: Any) -> Any:
         """Return g (learned equations and outputs,) in their units, at one point.
@@ -64,7 +75,6 @@ class MotionField:
         return self._values(numbers, self.seen(x, u))
 
     def _values(self, numbers: Numbers, z: Any) -> Any:
-        assert self.bound is not None
         return numbers.gain * self.bound.values(
             numbers.weights, (z - numbers.centre) / numbers.halfwidth
         )
@@ -72,7 +82,7 @@ class MotionField:
     @property
     def beyond(self) -> str:
         """Behaviour of the learner's correction beyond its training range."""
-        return "free" if self.bound is None else beyond_of(self.bound.learner, "fade")
+        return beyond_of(self.bound.learner, "fade")
 
     def addition(self, numbers: Numbers, x: Any, u: Any) -> Any:
         """Return the learner's addition to the physics at c, at one point.
@@ -114,16 +124,16 @@ class MotionField:
         """Return the equations' right-hand sides of physics and learner, each (nx,)."""
         physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
         learned = jnp.zeros(self.states)
-        states, _ = self.motion.learned
-        if self.bound is not None and states:
+        states, _ = self.corrected
+        if states:
             learned = learned.at[np.array(states)].set(self.addition(numbers, x, u)[: len(states)])
         return physics, learned
 
     def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
         """Return y (ny,)."""
         y = self.motion.observed(x, u, self.parameters(numbers), jnp)
-        states, outputs = self.motion.learned
-        if self.bound is not None and outputs:
+        states, outputs = self.corrected
+        if outputs:
             y = y.at[np.array(outputs)].add(self.addition(numbers, x, u)[len(states) :])
         return y
 
@@ -184,8 +194,6 @@ def _parts(
     def at(x: Any, u: Any) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)
         whole = physics(numbers.theta - numbers.theta_aux, x, u)
-        return split, whole - split + (
-            form.addition(numbers, x, u) if form.bound is not None else 0.0
-        )
+        return split, whole - split + (form.addition(numbers, x, u) if form.learns else 0.0)
 
     return jax.vmap(at)(x, u)

@@ -125,10 +125,9 @@ class MotionModel(RecordModel, NotebookView):
     """Preparation of the training data."""
 
     def __repr__(self) -> str:
-        learner = self.form.bound.learner if self.form.bound else "none"
         return (
             f"MotionModel({', '.join(f'{k} = {v:.5g}' for k, v in self.parameters.items())}, "
-            f"learner: {learner})"
+            f"learner: {self.form.bound.learner})"
         )
 
     @property
@@ -321,7 +320,7 @@ class MotionModel(RecordModel, NotebookView):
         measured = experiment.outputs if record.outputs else None
         nothing = np.zeros_like(whole)
         bounded = self.bounded(Parts(whole, nothing, nothing), experiment, measured)
-        if self.form.bound is None:
+        if not self.form.learns:
             return bounded
         alone = self.physics_only
         run = self._with_physics(bounded, self._follow(alone.form, alone.numbers, start, inputs)[1])
@@ -358,8 +357,6 @@ class MotionModel(RecordModel, NotebookView):
 
     def _outside(self, states: Matrix, inputs: Matrix) -> Any:
         """Return where the learner's features are outside those of training, (N,)."""
-        if self.form.bound is None:
-            return None
         with np.errstate(all="ignore"):
             return self.beyond(np.asarray(self.form.seen(states.T, inputs.T, np)).T)
 
@@ -447,9 +444,7 @@ class MotionModel(RecordModel, NotebookView):
             )[0]
             ends = [(self.form, self.numbers)]
             ends += (
-                [(self.physics_only.form, self.physics_only.numbers)]
-                if self.form.bound is not None
-                else []
+                [(self.physics_only.form, self.physics_only.numbers)] if self.form.learns else []
             )
             pieces.append(
                 [

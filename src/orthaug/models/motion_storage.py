@@ -73,7 +73,7 @@ def rebuild(
             parse_named(text, motion.known, "learner input") for text in declared["features"]
         ),
         bound=bound_of(
-            declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, path
+            declared["learner"], arrays.get("numbers.weights", np.zeros(0)), learner, 0, path
         ),
         sampling_time=float(declared["sampling_time"]),
         substeps=int(declared["substeps"]),

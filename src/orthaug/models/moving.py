@@ -15,6 +15,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
+from orthaug.models.learners import nothing_learned
 from orthaug.models.motion_field import MotionField
 from orthaug.physics.integrators import (
     UNROLLED,
@@ -56,11 +57,11 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
         through.append(
             list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True))
         )
-    to_x, to_c, to_w = identity, 0.0, 0.0
-    learned = np.array(form.motion.learned[0], dtype=int)
+    to_x, to_c, to_w = identity, 0.0, jnp.zeros((form.states, form.bound.size))
+    learned = np.array(form.corrected[0], dtype=int)
     for stages in reversed(through):  # `to_x` is what follows this substep
         to_c = to_c + to_x @ sum(psi @ stage.to_c for psi, stage in stages)
-        if form.bound is not None:
+        if learned.size:
             to_w = to_w + sum((to_x @ psi)[:, learned] @ stage.to_w for psi, stage in stages)
         to_x = to_x @ (identity + sum(psi @ stage.to_x for psi, stage in stages))
     return Slopes(x, to_x, to_c, to_w)
@@ -80,8 +81,8 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
 
     value, to_x, to_c = _differentiate(physics, x, c)
     to_x, to_c = _finite(to_x), _finite(to_c)
-    states, _ = form.motion.learned
-    if form.bound is None or not states:
+    states, _ = form.corrected
+    if not states:
         return Slopes(value, to_x, to_c, jnp.zeros((len(states), form.unknowns - len(c))))
     learner = learner_slopes(form, numbers, x, u)
     rows = np.array(states)
@@ -93,7 +94,6 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
 def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """Return g and its slopes at one point: learned equations first, then learned outputs."""
     bound = form.bound
-    assert bound is not None
 
     def features(x: Any) -> Any:
         return (form.seen(x, u) - numbers.centre) / numbers.halfwidth
@@ -120,8 +120,8 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
 
     value, to_x, to_c = _differentiate(physics, x, c)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
-    states, outputs = form.motion.learned
-    if form.bound is not None and outputs:
+    states, outputs = form.corrected
+    if outputs:
         learner, rows, count = learner_slopes(form, numbers, x, u), np.array(outputs), len(states)
         value = value.at[rows].add(learner.value[count:])
         to_x = to_x.at[rows].add(learner.to_x[count:])
@@ -172,7 +172,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def differentiable(self) -> bool:
-        return self.bound is None or self.bound.differentiable
+        return self.bound.differentiable
 
     @property
     def used(self) -> tuple[Lag, ...]:
@@ -182,7 +182,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     @property
     def physics_only(self) -> MotionDynamics:
         """These dynamics without the learner."""
-        return replace(self, features=(), bound=None)
+        return replace(self, features=(), bound=nothing_learned())
 
     def start(
         self, outputs: Matrix, rows: Sequence[int] | Int[np.ndarray, "r"]
@@ -276,10 +276,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(
             states, inputs
         )
-        known = 4 if self.bound is not None else 3  # there are no weights otherwise
-        value, to_x, *own = (
-            jnp.concatenate(both) for both in zip(following[:known], output[:known], strict=True)
-        )
+        value, to_x, *own = (jnp.concatenate(both) for both in zip(following, output, strict=True))
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
     def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:

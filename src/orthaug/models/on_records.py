@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -12,9 +12,13 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, show
 from orthaug.data.preparation import steps_again
 from orthaug.data.record import Channel, Experiment, Preparation, Record, same_step
-from orthaug.models.dynamics import Dynamics, Numbers, Parts
+from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
+
+if TYPE_CHECKING:
+    from orthaug.models.lagged import LaggedDynamics
+    from orthaug.models.moving import MotionDynamics
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 
@@ -24,13 +28,18 @@ WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrap
 class RecordModel:
     """A model of some channels at a sampling time."""
 
-    form: Dynamics
+    form: LaggedDynamics | MotionDynamics
     numbers: Numbers
     outputs: tuple[Channel, ...]
     inputs: tuple[Channel, ...]
     sampling_time: float
     largest_output: Vector
     prepared: tuple[Preparation, ...]
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.form.learns
 
     @property
     def preparation(self) -> tuple[Any, ...]:

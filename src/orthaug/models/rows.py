@@ -300,11 +300,7 @@ def learner_rows(
     Outputs are multiplied by `weight`, (ny, ny) or (N, ny, ny).
     """
     z = np.asarray(form.features.evaluate(x, form.layout, np))
-    scaled = (
-        (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
-        if form.bound
-        else np.zeros((len(x), 0))
-    )
+    scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
     return engine.build_rows(scaled, q, np.zeros(gain.shape[:2]), gain)
 
@@ -332,7 +328,7 @@ class MixedGram:
     of Q.
     """
 
-    bound: Bound | None
+    bound: Bound
 
     def __call__(self, chunk: Chunk, w: Any, mix: Any, overlaps: tuple[Any, ...] = ()) -> Any:
         columns = jnp.concatenate(_columns(self.bound, chunk, w, overlaps))
@@ -343,26 +339,22 @@ class MixedGram:
 class _LeftOver:
     """QᵀJ, with J less its `overlaps`."""
 
-    bound: Bound | None
+    bound: Bound
 
     def __call__(self, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> Any:
         return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-def _columns(
-    bound: Bound | None, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]
-) -> tuple[Any, Any]:
+def _columns(bound: Bound, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
     """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
-    jacobian = (
-        jnp.zeros((0, *q.shape[1:])) if bound is None else bound.jacobian(w, chunk.z, chunk.gain)[1]
-    )
+    jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
     for overlap in overlaps:
         jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
     return q, jacobian
 
 
-def projected_gram(engine: Engine, bound: Bound | None, w: Any, rows: Any, mix: Any) -> Matrix:
+def projected_gram(engine: Engine, bound: Bound, w: Any, rows: Any, mix: Any) -> Matrix:
     """Return the Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
 
     J is projected twice, so that Q and it are orthogonal.
@@ -382,13 +374,11 @@ def row_values(
     return jax.lax.map(one_chunk, z)
 
 
-def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
+def _values(bound: Bound, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
     """Return F of one chunk.
 
     For an ensemble it is the median of the members, each with the physics that it adds.
     """
-    if bound is None:
-        return jnp.zeros_like(chunk.e)
 
     def member_values(w: Any) -> Any:
         values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
@@ -403,7 +393,7 @@ def _values(bound: Bound | None, chunk: Chunk, w: Any, tilt: Any) -> Float[Array
 class LearnerSums:
     """Qᵀ(F − Q shift) and ‖F‖² of one chunk."""
 
-    bound: Bound | None
+    bound: Bound
 
     def __call__(self, chunk: Chunk, w: Any, tilt: Any, shift: Any) -> tuple[Any, Any]:
         values = _values(self.bound, chunk, w, tilt)
@@ -415,7 +405,7 @@ class LearnerSums:
 class ResidualGram:
     """Σ r rᵀ of one chunk, `r = P⊥Y − F + Q physics`."""
 
-    bound: Bound | None
+    bound: Bound
 
     def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
         residual = (

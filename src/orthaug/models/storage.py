@@ -108,11 +108,10 @@ def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | N
     yield "largest_output", model.largest_output, (outputs,)
     yield "deviation", model.deviation, (outputs,)
     yield "output_weight", model.weight, (outputs, outputs)
-    if form.bound is not None:
-        yield "centre", numbers.centre, (form.bound.nz,)
-        yield "halfwidth", numbers.halfwidth, (form.bound.nz,)
-        yield "gain", numbers.gain, (form.bound.ny,)
-        yield "weights", numbers.weights, None
+    yield "centre", numbers.centre, (form.bound.nz,)
+    yield "halfwidth", numbers.halfwidth, (form.bound.nz,)
+    yield "gain", numbers.gain, (form.bound.ny,)
+    yield "weights", numbers.weights, None
     for name in ("tilt", "pull"):
         if getattr(numbers, name) is not None:
             yield name, getattr(numbers, name), None

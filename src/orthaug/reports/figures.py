@@ -143,7 +143,7 @@ class FitPlots:
         """
         response, i = self._response("simulate", record, output, experiment)
         axis = self._outputs(response, i, experiment, "free run", ax)
-        if self.fit.model.form.bound is not None:
+        if self.fit.learns:
             alone = self.fit.model.physics_only.simulate(self._record(record)).trajectories[
                 experiment
             ]

@@ -166,10 +166,10 @@ def _motion(motion: Motion) -> Card:
 @card_of.register(Estimate)
 @card_of.register(MotionEstimate)
 def _fit_card(fit: Estimate | MotionEstimate) -> Card:
-    bound, status = fit.model.form.bound, fit.status
+    status = fit.status
     facts = {
         "structure": fit.model.structure,
-        "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
+        "learner": str(fit.model.form.bound),
         "data": repr(fit.problem.record),
         "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss "
         f"{status.loss:.6g}",
@@ -212,10 +212,9 @@ def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
 @card_of.register(Model)
 @card_of.register(MotionModel)
 def _model(model: Model | MotionModel) -> Card:
-    bound = model.form.bound
     facts = {
         "structure": model.structure,
-        "learner": "none" if bound is None else f"{bound.learner}, {bound.size} weights",
+        "learner": str(model.form.bound),
         "outputs": ", ".join(channel.label for channel in model.outputs),
         "inputs": ", ".join(channel.label for channel in model.inputs),
         "sampling time": f"{model.sampling_time:g} s",

@@ -240,7 +240,7 @@ def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | 
 
     None where nothing was learned.
     """
-    if fit.model.form.bound is None:
+    if not fit.learns:
         return None
     if isinstance(fit, Estimate):
         return LearnedPart.of_lagged(fit.model, record)

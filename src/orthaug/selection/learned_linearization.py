@@ -103,7 +103,7 @@ def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinea
     Raises:
         InputError: a model without a learner, other channels, too few rows, or none with a value.
     """
-    if model.form.bound is None:
+    if not model.learns:
         raise InputError("the model is physics alone: it has no learner that could be explained.")
     linearization = (
         _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)

@@ -35,6 +35,7 @@ from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.lagged import LaggedDynamics
+from orthaug.models.learners import nothing_learned
 from orthaug.physics.problem import Problem
 from orthaug.selection.forward import COLLINEAR, Equations
 
@@ -163,7 +164,7 @@ class TermRuns:
             factors,
             layout,
             names[0],
-            None,
+            nothing_learned(len(names[0])),
             width=_PLACES,
             order=max(library.order, 1),
         )

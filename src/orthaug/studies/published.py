@@ -135,7 +135,6 @@ def train(
     problem = pose(example.train, example.baseline)
     nz, nt = len(problem.features.entries), len(problem.baseline.names)
     task = OneStepTask.of(problem, MLP((NEURONS,)), Scaling(np.zeros(nz), np.ones(nz)), np.ones(1))
-    assert task.bound is not None
     data, kind = Data.of(problem, structure), (task.bound, structure.projects)
     start = jnp.asarray(np.concatenate([problem.baseline.initial, initial_weights(seed, nz)]))
     start = _adam(start, data, *kind, iterations[0])
@@ -164,7 +163,6 @@ def _run(
     task: OneStepTask, w: Any, iterations: int, converged: bool, seconds: float
 ) -> TrainingRun:
     """Return the statistics' input from a run that ended at `w`."""
-    assert task.bound is not None
     nt = len(task.problem.baseline.names)
     hold = Hold(jnp.zeros((nt, nt)), jnp.zeros(nt))
     nothing = Overlap(jnp.zeros((nt, task.bound.size)), jnp.zeros(nt))

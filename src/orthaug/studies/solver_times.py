@@ -62,7 +62,6 @@ def one(example: str, solver: str, share: float, seed: int) -> dict[str, Any]:
     """
     given = static(1) if example == "static" else mass_spring_damper()
     task = OneStepTask.of(pose(given.train, given.baseline), MLP())
-    assert task.bound is not None
     start, chosen = task.bound.init(jax.random.key(seed)), declare_solver(solver, example, share)
     task.run(declare_solver(solver, example, 0.01), start, Orthogonal())
     run = task.run(chosen, start, Orthogonal())
