@@ -17,7 +17,7 @@ from machine import ROOT, data_folder, describe
 
 from orthaug.commands.fit import fit_variant
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
-from orthaug.commands.kinds import open_job
+from orthaug.commands.opening import open_job
 from orthaug.fitting import objective
 from orthaug.fitting.estimation import fit
 

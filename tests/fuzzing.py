@@ -206,7 +206,7 @@ def try_file(kind: str, seed: int, original: bytes, folder: Path) -> str:
 
 def try_spec(seed: int, text: str, folder: Path) -> str:
     """One mutation of a spec, opened with its data: what is accepted holds what the file says."""
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
 
     rng = np.random.default_rng([100, seed])
     path = folder / "spec.toml"
@@ -268,7 +268,7 @@ def _agrees(given: object, kept: object) -> bool:
 
 def try_model(seed: int, original: dict[str, bytes], folder: Path) -> str:
     """One mutation of a saved model: refused, or bit by bit what was saved. With a forged checksum: no traceback."""
-    from orthaug.models import storage
+    from orthaug.models import packed_files, storage
 
     rng = np.random.default_rng([200, seed])
     victim = sorted(original)[rng.integers(len(original))]
@@ -284,7 +284,7 @@ def try_model(seed: int, original: dict[str, bytes], folder: Path) -> str:
     if forged:
         declared = _json_changed(json.loads(original["model.json"]), rng)
         declared.pop("checksum", None)
-        declared["checksum"] = storage._checksum(declared)
+        declared["checksum"] = packed_files._checksum(declared)
         (folder / "model.json").write_text(json.dumps(declared), encoding="utf-8")
 
     def judge() -> str:

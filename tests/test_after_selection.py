@@ -254,6 +254,51 @@ def test_a_fit_of_the_rows_that_chose_has_no_intervals(write):
     assert "the terms were chosen on the rows that were fitted" in pages[1]
 
 
+MOTION = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"] }
+[motion.states]
+x = { derivative = "u - k*x", start = "y", learned = true }
+[motion.outputs]
+y = "x"
+[motion.parameters]
+k = { initial = 1.0 }
+[learner]
+kind = "terms"
+terms = ["x**3"]
+[validation]
+blocks = 0
+[selection.chosen_on]
+files = ["run.csv"]
+rows = ROWS
+"""
+
+
+@pytest.mark.parametrize(("rows", "withheld"), [("[0, 150]", True), ("[150, 200]", False)])
+def test_terms_of_a_motion_that_its_rows_chose_have_no_intervals(
+    tmp_path, monkeypatch, without_figures, rows, withheld
+):
+    monkeypatch.chdir(tmp_path)
+    u = np.sin(0.3 * np.arange(200)) + np.sin(0.11 * np.arange(200))
+    y = np.zeros(200)
+    for k in range(199):
+        y[k + 1] = y[k] + 0.1 * (u[k] - y[k] - 0.2 * y[k] ** 3)
+    noise = 0.01 * np.random.default_rng(0).normal(size=200)
+    np.savetxt("run.csv", np.column_stack([u, y + noise]), delimiter=",", header="u,y", comments="")
+    train = "" if withheld else ", rows = [0, 150]"
+    text = MOTION.replace("ROWS", rows).replace('["run.csv"] }', f'["run.csv"]{train} }}')
+    Path("spec.toml").write_text(text, encoding="utf-8")
+    done = run("fit", "spec.toml", "--out", "out", "--json")
+    assert done.code == 0, done.err
+    fit = finite_json(done.out)
+    assert [row["ci95"] is None for row in fit["parameters"]] == [withheld]
+    assert ("conditional_on_selection" in [w["code"] for w in fit["warnings"]]) is withheld
+    assert (fit["standard_errors_by"] == "chosen") is withheld
+
+
 def test_short_data_have_no_intervals_from_the_shell(write):
     result, fit = selected(write([300]))
     assert result["intervals"]["source"] == fit["intervals"]["source"] == "none"

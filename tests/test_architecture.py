@@ -56,6 +56,7 @@ ENTRIES = {
     "commands.": "a command, or a part of the page, has a file of its own",
 }
 CONCEPTS = {
+    "analysis.closed_loop": "a test of inputs for feedback",
     "analysis.contraction": "a norm in which a free run forgets its start",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.inconsistency": "a test of one-step θ",
@@ -75,8 +76,6 @@ CONCEPTS = {
     "fitting.recursive_storage": "the format of a saved recursive estimate",
     "fitting.segmented_streamed": "segments of rows that remain in a source",
     "models.devices": "an engine, an entry of the registry",
-    "models.lagged_storage": "the format of a saved lagged model",
-    "models.motion_storage": "the format of a saved motion",
     "reports.figures": "figures from Python",
     "reports.linear_text": "linear views in words",
     "reports.page_findings": "a section of the page",
@@ -390,7 +389,7 @@ def test_what_a_fit_seldom_needs_is_not_loaded_for_it(tmp_path: Path) -> None:
 
 def test_reading_a_spec_and_its_data_does_not_load_jax() -> None:
     names = [n for n in FILES if room_of(n) in ("data", "physics")] + [
-        "commands.kinds",
+        "commands.opening",
         "commands.run",
     ]
     report = loaded_by(

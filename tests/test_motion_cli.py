@@ -284,6 +284,7 @@ def test_the_folder_has_figures_and_a_page(folder, printed, result):
         "components",
         "learner",
         "bias",
+        "residuals_free_run",
     }
     page = (folder / "out" / "report.html").read_text()
     assert ">(force - c*v - k*x)/m</td>" in page and ">dv/dt</th>" in page

@@ -15,8 +15,8 @@ from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
 from orthaug.data.expressions import parse_named
+from orthaug.fitting.field_points import field_under
 from orthaug.fitting.motion_estimates import fitted_numbers
-from orthaug.fitting.motion_measures import field_under
 from orthaug.inference.motion_split import nearest, shared_of_motion
 from orthaug.models.learners import Bound
 from orthaug.models.motion_field import parts_at

@@ -206,7 +206,9 @@ def test_a_motion_has_a_page_too(motion):
         speed[k + 1] = np.exp(-0.05) * speed[k] + (1 - np.exp(-0.05)) * u[k]
     measured = speed[:120] + 0.01 * np.random.default_rng(0).normal(size=120)
     record = oa.Record.from_arrays(u, measured, sampling_time=0.1, outputs=["x"])
-    assert "c*v" in oa.estimate(record, motion, learner=None).report().html
+    fit = oa.estimate(record, motion, learner=None)
+    assert "c*v" in fit.report().html
+    assert "c*v" in fit.split(oa.Uniform()).report().html  # this measure's name alone is in the fit
 
 
 def test_the_page_of_a_fit(fit, tmp_path):

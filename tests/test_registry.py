@@ -209,7 +209,7 @@ def test_the_kinds_of_a_file_are_the_classes_of_the_library():
 def test_reading_a_spec_loads_no_jax():
     """Declarations are there, and with them every key of the spec, before anything is compiled."""
     program = (
-        "import sys, orthaug.commands.kinds, orthaug.commands.spec as spec\n"
+        "import sys, orthaug.commands.opening, orthaug.commands.spec as spec\n"
         "spec.spec_model()\n"
         "print([name for name in ('jax', 'optax') if name in sys.modules])"
     )

@@ -29,8 +29,8 @@ from orthaug.analysis.motion_suspects import (
     usual_motion_suspects,
 )
 from orthaug.analysis.robustness import block_of
+from orthaug.fitting.field_points import field_under
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_measures import field_under
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.inference.motion_split import (

@@ -89,8 +89,10 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
 
     It runs in the same compiled programs.
     """
-    solver, learner = LevenbergMarquardt().within_limit, fit.model.form.bound.learner
-    return dead_times(on_longest(fit.problem, fit.criterion, solver, Orthogonal(), learner), solver)
+    solver, posed = LevenbergMarquardt().within_limit, fit.problem
+    posed = posed if fit.learns else posed.without_learner()
+    learner = fit.model.form.bound.learner
+    return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _colour_sentence(fit: MotionEstimate) -> str:

@@ -149,7 +149,7 @@ def _withheld(fit: Any) -> Any:
         else " A formula for white errors gives standard errors of "
         + ", ".join(
             f"{std:.2g} of {name}"
-            for name, std in zip(_names(fit), fit.std, strict=True)
+            for name, std in zip(fit.problem.names, fit.std, strict=True)
             if np.isfinite(std)
         )
         + ", which are too small."
@@ -165,10 +165,6 @@ def _withheld(fit: Any) -> Any:
         std_kind="none",
         warnings=(*fit.warnings, Warning("too_long_memory", text)),
     )
-
-
-def _names(fit: Any) -> tuple[str, ...]:
-    return tuple(fit.problem.baseline.names if fit.lagged else fit.problem.motion.names)
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:

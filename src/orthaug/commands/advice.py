@@ -14,20 +14,15 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from orthaug._base.errors import InputError
 from orthaug._base.lines import plural
 from orthaug._base.progress import LOG
-from orthaug.analysis.suspects import Suspect
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
-from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
-from orthaug.physics.motion import HOLDS
-from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult, SuspectResult
+from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult
 from orthaug.reports.result import FitResult
 
 _SHAPES = {
@@ -39,8 +34,6 @@ _SHAPES = {
 }
 _TERMS = 3  # suspected terms that are proposed
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
-_ROWS = 20_000  # of the residual that are looked at
-_SPANNED = 1e-9  # of a term's squares: what is left of it beside the physics where it is physics
 _WIDER = 2  # times the neurons
 _ZONE = "dead_zone"
 
@@ -109,9 +102,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     """Yield the suspects that explain most of the learned part, or of the physics' residual."""
-    plain = job.spec.motion is None and not fit.learns and len(fit.theta) > 0
-    left = _residual_columns(fit) if plain else None
-    found = []
+    left, found = job.physics.explained_residual(fit), []
     for entry in result.bias or ():
         if entry.memory is not None:  # no expression of one row is that term
             continue
@@ -119,68 +110,21 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
         if entry.residual is not None:
             share, size = entry.residual.share, entry.residual.coefficient
         elif left is not None:
-            share, size = _residual_share(fit, entry, *left)
+            share, size = left(entry)
         positive = entry.name.startswith(_ZONE)
         if (share or 0.0) > _LITTLE and not (
             positive and (size or 0.0) < 0
         ):  # that would be no dead zone
             found.append((share or 0.0, entry, size, positive))
     for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
-        where = entry.output if job.spec.motion is None else entry.equation
-        yield from _term(
-            job, entry.expression, where, size or entry.coefficient, "", positive=positive
-        )
-
-
-def _residual_columns(fit: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return an orthonormal basis of the physics (N ny, nθ) and the residual beside it (N ny,).
-
-    Both are scaled by the deviations of the outputs; the residual is the one-step one.
-    """
-    problem = fit.problem
-    x, unit = problem.rows.x[:: _stride(fit)], problem.deviation
-    phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)) / unit[:, None]
-    basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
-    runs = fit.model.predict(problem.record).trajectories
-    error = (
-        np.concatenate([(run.measured - run.model)[problem.rows.start :] for run in runs])[
-            :: _stride(fit)
-        ]
-        / unit
-    )
-    return basis, error.ravel() - basis @ (basis.T @ error.ravel())
-
-
-def _stride(fit: Any) -> int:
-    """Return the stride of the rows that are looked at."""
-    return 1 + len(fit.problem.rows.x) // _ROWS
-
-
-def _residual_share(
-    fit: Any, entry: SuspectResult, basis: np.ndarray, error: np.ndarray
-) -> tuple[float, float]:
-    """Return the share of the one-step residual that a suspect explains, and its coefficient.
-
-    Both are beside the physics: the part of the suspect that the physics spans is removed.
-    """
-    problem = fit.problem
-    constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
-    suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
-    column = (
-        suspect.values(problem.rows.x[:: _stride(fit)], problem.layout, problem.outputs)
-        / problem.deviation
-    )
-    rest = column.ravel() - basis @ (basis.T @ column.ravel())
-    along, size = float(rest @ error), float(rest @ rest)
-    if not size > _SPANNED * float(column.ravel() @ column.ravel()):
-        return 0.0, 0.0
-    return along**2 / size / max(float(error @ error), np.finfo(float).tiny), along / size
+        place, size = entry.equation or entry.output, size or entry.coefficient
+        yield from _term(job, entry.expression, place, size, "", positive=positive)
 
 
 def _term(
     job: Job,
     expression: str,
-    equation: str | None,
+    place: str | None,
     size: float | None,
     words: str,
     *,
@@ -190,80 +134,21 @@ def _term(
 
     Yields nothing where the spec has the term already.
     """
-    spec, declared = job.spec, job.declaration
-    name, initial = _new_name(job), float(size or 0.0)
-    if spec.motion is not None:
-        equation = _equation(job, equation)
-        if equation is None:
-            return
-        places = declared["motion"]["states"]
-        key = "next" if spec.motion.discrete else "derivative"
-        own = str(places[equation][key])
-        if f"*{_squeeze(expression)}" in _squeeze(own):
-            return
-        change: dict[str, Any] = {
-            f"motion.states.{equation}.{key}": f"{own} + {name}*({expression})",
-            f"motion.parameters.{name}": {"initial": initial},
-        }
-        where = f"in the equation of {equation}"
-    else:
-        terms = declared["baseline"]["terms"]
-        several = len(spec.data.outputs) > 1
-        if any(
-            _is_same(str(term["regressor"]), expression, term.get("output"), equation)
-            for term in terms
-        ):
-            return
-        own_output = {"output": equation} if several and equation is not None else {}
-        change = {
-            "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **own_output}]
-        }
-        if spec.physics is not None:
-            change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
-            change[f"physics.theta.{name}"] = name
-        where = f"in the physics{f' of {equation}' if several and equation is not None else ''}"
-    what = words or f"the term {expression}"
-    yield Proposal(f"{what} {where}", change, positive=name if positive else None)
-
-
-def _equation(job: Job, equation: str | None) -> str | None:
-    """Return the state whose equation a term is added to; None for a term of an output."""
-    from orthaug.analysis.motion_suspects import equations_of, usual_places
-
-    motion = job.problem.motion
-    if equation is None:
-        places = usual_places(motion)
-        equation = equations_of(motion)[places[0]] if len(places) == 1 else None
-    return equation if equation in motion.names_of_states else None
+    name = _new_name(job)
+    made = job.physics.with_term(job, name, expression, place, float(size or 0.0))
+    if made is not None:
+        change, where = made
+        what = words or f"the term {expression}"
+        yield Proposal(f"{what} {where}", change, positive=name if positive else None)
 
 
 def _new_name(job: Job) -> str:
     """Return a name for a parameter that the spec does not use."""
     spec, number = job.spec, 1
-    taken = set(spec.data.inputs) | set(spec.data.outputs)
-    if spec.motion is not None:
-        taken |= {
-            *spec.motion.states,
-            *spec.motion.parameters,
-            *spec.motion.define,
-            *spec.motion.constants,
-        }
-    elif spec.baseline is not None:
-        taken |= {term.parameter for term in spec.baseline.terms} | set(spec.baseline.constants)
-        taken |= set(spec.physics.parameters) if spec.physics is not None else set()
+    taken = {*spec.data.inputs, *spec.data.outputs, *job.physics.names_taken(spec)}
     while (name := f"size{number if number > 1 else ''}") in taken:
         number += 1
     return name
-
-
-def _squeeze(text: str) -> str:
-    return "".join(text.split())
-
-
-def _is_same(one: str, other: str, output: str | None, equation: str | None) -> bool:
-    return _squeeze(one) == _squeeze(other) and (
-        output is None or equation is None or output == equation
-    )
 
 
 def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -297,8 +182,6 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     from orthaug.physics.shared import seen_columns
 
     spec, problem, bound = job.spec, job.problem, fit.model.form.bound
-    if spec.motion is not None:
-        return
     if spec.declared_learner() is None:
         yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
         return
@@ -330,7 +213,7 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
     Where there is one already, it is given the signals that the missing part depends on.
     """
     test = result.residuals.missing if result.residuals is not None else None
-    if job.spec.motion is None or test is None or not test.terms or result.residuals is None:
+    if test is None or not test.terms or result.residuals is None:
         return
     best = test.terms[0]
     if result.residuals.verdict != "unmodelled" or best.variable is None:
@@ -352,24 +235,18 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
 
 
 def _reads(inputs: tuple[str, ...], variable: str) -> bool:
-    return any(_squeeze(text) == variable for text in inputs)
+    return any("".join(text.split()) == variable for text in inputs)
 
 
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the holds of the inputs that a motion does not use yet."""
-    motion = job.spec.motion
-    if motion is None or not job.spec.data.inputs or motion.discrete:
-        return
+    """Yield the holds of the inputs that are not used yet."""
     if result.residuals is None or result.residuals.verdict != "unmodelled":
         return
-    for hold in HOLDS:
-        if hold != motion.hold:
-            yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
+    for hold in job.physics.other_holds(job.spec):
+        yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
 
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
-# Changes that are tried: together they take about as long as the fit
-_MOST, _MOST_OF_A_MOTION = (3, 2)
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _LISTED = 3  # changes without gain that the text names
 
@@ -425,18 +302,17 @@ class Trials:
     rows: ValidationRows
     variant: Variant
     unit: Any
-    substeps: int | None = None
-    """Substeps of a motion that is integrated."""
+    settled: dict[str, Any]
+    """What the fit has chosen, as a change of the spec: a search would cost most."""
 
     def changed_job(self, change: dict[str, Any]) -> Job:
-        """Return the job of a changed spec, with the substeps of the fit: a search would cost most.
+        """Return the job of a changed spec, with what the fit has chosen.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
-        fixed = {} if self.substeps is None else {"motion.substeps": self.substeps}
         return self.job.with_spec(
-            spec_model().model_validate(apply_change(self.job.declaration, change | fixed))
+            spec_model().model_validate(apply_change(self.job.declaration, change | self.settled))
         )
 
     def run(
@@ -498,13 +374,11 @@ def advise(
         return None
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
-    motion = result.motion
-    substeps = None if motion is None or motion.discrete else motion.substeps
-    trials = Trials(job, rows, variant, fit.problem.deviation, substeps)
+    trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))
     base = trials.run(trials.changed_job({}), variant)
     if base is None:
         return None
-    chosen = found[: _MOST if motion is None else _MOST_OF_A_MOTION]
+    chosen = found[: job.physics.most_trials]
     tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
     return _conclude_trials(base, tried, rows, len(found) - len(tried), learns)
 

@@ -14,7 +14,7 @@ from orthaug.physics.baseline import Baseline
 from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, split_record
 
 if TYPE_CHECKING:
-    from orthaug.commands.lagged_job import LaggedJob
+    from orthaug.commands.job import Job
     from orthaug.commands.spec import Spec
 
 _CONDITIONAL = (
@@ -56,7 +56,7 @@ class Rows:
 
 
 def parts_of(
-    job: LaggedJob, baseline: Baseline, lags: int, halves: bool | None, *, network: bool
+    job: Job, baseline: Baseline, lags: int, halves: bool | None, *, network: bool
 ) -> Parts:
     """Cut the training data of a job so that its spec can say how.
 
@@ -83,7 +83,7 @@ def parts_of(
         return Parts(record, record, Intervals.empty(str(error)))
 
 
-def _not_cut(job: LaggedJob, expected: int) -> str:
+def _not_cut(job: Job, expected: int) -> str:
     """Return why a spec cannot say how the training data are cut; nothing where it can."""
     if any(step.step in _MOVES_ROWS for step in job.spec.data.prepare):
         return (
@@ -98,7 +98,7 @@ def _not_cut(job: LaggedJob, expected: int) -> str:
     return ""
 
 
-def split_rows(job: LaggedJob, parts: Parts) -> tuple[Rows, Rows]:
+def split_rows(job: Job, parts: Parts) -> tuple[Rows, Rows]:
     """Return the rows that chose and those that are fitted, as a spec says them."""
     section, record = job.spec.data.train, job.train.record
     files = expand_files(job.path, section.files, "train")
@@ -125,7 +125,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
     """
     spec: Spec = job.spec
     chosen, bound = spec.selection.chosen_on, fit.model.form.bound
-    if chosen is None or spec.motion is not None or not isinstance(bound.learner, Terms):
+    if chosen is None or not isinstance(bound.learner, Terms):
         return None
     train = Rows.of(expand_files(job.path, spec.data.train.files, "train"), spec.data.train.rows)
     if Rows.of(chosen.files, chosen.rows).meets(train, job.path.parent):

@@ -65,20 +65,22 @@ def check(
 ) -> None:
     """Report excitation and identifiability; trains nothing."""
     from orthaug.commands.folder import check_figure, save_figure
-    from orthaug.commands.kinds import kind_of, open_job
+    from orthaug.commands.job_result import check as check_job
+    from orthaug.commands.job_result import refusal
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import check_text
 
     job = open_job(spec, require_full_rank=False)
     check_figure(figure, *job.files, force=force)
-    if job.spec.motion is not None:  # its runs are computed
+    if job.physics.runs_in_check:
         prepare_jax()
-    result = kind_of(job).check(job)
+    result = check_job(job)
     print_result(result, check_text(result), as_json)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
-    refused = kind_of(job).refusal(job, result)
+    refused = refusal(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 
@@ -96,7 +98,7 @@ def fit(
     """Fit a spec, print a summary and write the result folder."""
     from orthaug.commands.fit import fit_job, keep_states, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import fit_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -106,7 +108,7 @@ def fit(
     prepare_jax()
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
-    learns, rows = job.spec.declared_learner() is not None, getattr(job.problem, "count", 0)
+    learns, rows = job.spec.declared_learner() is not None, job.problem.count
     with training_bar(job.run_count, job.iterations, learns, rows) as progress:
         fitted = fit_job(job, progress)
     if other_writes():
@@ -135,7 +137,7 @@ def compare(
 ) -> None:
     """Compare physics alone and every structure in one table."""
     from orthaug.commands.folder import check_folder, check_inputs_kept
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.text import compare_text
 
     folder = out or Path("orthaug-out") / spec.stem
@@ -170,7 +172,7 @@ def design(
     """
     from orthaug.commands import design as designing
     from orthaug.commands.folder import check_file
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
     from orthaug.reports.result import DesignResult
     from orthaug.reports.text import design_text
 

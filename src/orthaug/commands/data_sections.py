@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from orthaug._base.checks import check_label
 from orthaug._base.errors import InputError
 from orthaug._base.memory import available
+from orthaug._base.registry import resolve
 from orthaug.commands.sections import (
     Count,
     Finite,
@@ -23,6 +24,10 @@ from orthaug.commands.sections import (
 )
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.kinds import CRITERIA
+from orthaug.models.learners import Learner
+from orthaug.models.terms import over_states
 from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion, Output, State
 
@@ -193,6 +198,8 @@ class MotionSection(KindSection):
     """Equations of motion: states, outputs, parameters, and how they are integrated."""
 
     registries = {"integrator": INTEGRATORS}
+    reads_all_rows: ClassVar[str] = "a motion"
+    foreign_keys: ClassVar[Mapping[str, str]] = {"output": "beside [motion]; expected `equation`"}
     integrator: str = "rk4"
     substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"
     hold: Literal[HOLDS] = "zero-order"  # type: ignore[valid-type]
@@ -227,6 +234,19 @@ class MotionSection(KindSection):
             output.learned for output in self.outputs.values() if not isinstance(output, str)
         )
         return any(state.learned for state in self.states.values()) or any(outputs)
+
+    def over(self, learner: Any, spec: Any) -> Learner:
+        """Return a learner of terms over the states and inputs of a spec."""
+        return over_states(learner, self.motion_of(spec.data.inputs, spec.data.outputs))
+
+    def criterion(self, training: Any) -> Criterion:
+        """Return the criterion of a spec.
+
+        A motion is trained on its free run, from starts that are estimated: without a washout.
+        """
+        focus = "simulation" if training.focus == "auto" else training.focus
+        washout = {} if "washout" in training.model_fields_set else {"washout": 0}
+        return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
     def motion_of(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
         """Return the motion, with its channels in the order of the data.

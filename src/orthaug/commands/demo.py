@@ -13,7 +13,7 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.lines import fold
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import FitReport, fill_result, fit_job
-from orthaug.commands.kinds import open_job
+from orthaug.commands.opening import open_job
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug.analysis.design import MOST_SAMPLES, Design, design_input
+from orthaug.analysis.design import MOST_SAMPLES, Design
 from orthaug.commands.job import Job
-from orthaug.commands.motion_job import MotionJob
-from orthaug.commands.suspects import declare_suspects
 
 
 def design_for(job: Job) -> Design:
@@ -42,52 +39,9 @@ def design_for(job: Job) -> Design:
         )
         asked["known_inputs"] = _other_inputs(job, asked["channel"], section.samples)
         asked["sampling_time"] = job.problem.record.sampling_time
-        if isinstance(job, MotionJob):
-            return _of_motion(job, asked, section.noise)
-        return _of_lags(job, asked, section.noise)
+        return job.physics.design(job, asked, section.noise)
     except InputError as error:
         raise InputError(f"{job.path}: design: {error}") from None
-
-
-def _of_lags(job: Job, asked: dict[str, Any], noise: float | None) -> Design:
-    problem = job.problem
-    theta = problem.projection.solve(problem.whitened_target)
-    residual = problem.weight.outputs(problem.whitened_target - problem.projection.phi @ theta)
-    given = problem.baseline.initial
-    return design_input(
-        problem.baseline,
-        outputs=problem.outputs,
-        inputs=[channel.name for channel in problem.record.inputs],
-        suspects=declare_suspects(job.spec.suspects, problem),
-        noise=tuple(residual.std(axis=0)) if noise is None else noise,
-        theta=given if np.all(given) else theta,
-        **asked,
-    )
-
-
-def _of_motion(job: MotionJob, asked: dict[str, Any], noise: float | None) -> Design:
-    from orthaug.analysis.motion_design import design_motion_input
-    from orthaug.fitting.motion_estimation import without_learner
-    from orthaug.fitting.motion_task import MotionTask
-
-    spec, motion = job.spec, job.problem.motion
-    task = MotionTask.of(without_learner(job.problem), None, spec.declared_criterion())
-    solver: Any = spec.declared_solver()
-    task = task.prepare(solver, job.structure)
-    if task.physics is None:
-        raise InputError(
-            "physics alone has no finite free run from its initial values; give others."
-        )
-    left: Any = noise
-    if noise is None:
-        left = tuple(
-            np.sqrt(
-                np.sum(task.physics.end.point.errors**2, axis=(0, 1, 3)) / task.plan.segments.count
-            )
-        )
-    p = motion.coordinates.physical(task.physics.end.point.theta)
-    own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
-    return design_motion_input(motion, suspects=job.suspects, **own, **asked)
 
 
 def _input(name: str | None, known: list[str]) -> str:

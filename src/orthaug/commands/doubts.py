@@ -109,13 +109,9 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
         if one.sure and one is not best and one.share > 0.8 * best.share
     ]
     beside = f" ({', '.join(others[: _LISTED - 1])} nearly as much)" if others else ""
-    remedy = "write the state out as a state of the motion with its own equation"
-    if fit.lagged:
-        remedy = (
-            "add lags of outputs and inputs to the physics, or write the system as a motion "
-            "with that state"
-        )
-    remedy += "; or let the learner see lags or a filtered copy of that signal"
+    remedy = (
+        f"{fit.problem.new_state}; or let the learner see lags or a filtered copy of that signal"
+    )
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
         f"the free run's error on held-out rows{beside}. No function of the model's own states "
@@ -139,8 +135,7 @@ def _movement_text(fit: Any, best: FamilyTest) -> str:
 
 
 def _current_values(fit: Any) -> dict[str, float]:
-    names = fit.problem.baseline.names if fit.lagged else fit.problem.motion.names
-    return dict(zip(names, map(float, fit.theta if fit.lagged else fit.values), strict=True))
+    return dict(zip(fit.problem.names, map(float, fit.values), strict=True))
 
 
 def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
@@ -149,7 +144,7 @@ def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
     moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
     if len(best.moves) != len(names):
         return {}
-    values = moved if fit.lagged else fit.problem.motion.coordinates.physical(moved)
+    values = fit.problem.values_at(moved)
     return {
         name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
     }

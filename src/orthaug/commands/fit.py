@@ -15,12 +15,12 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
+from orthaug.commands import job_result
 from orthaug.commands.attempt import attempt
 from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.doubts import with_doubts
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import AS_DECLARED, DEFAULT_BLOCKS, PHYSICS_ONLY, Job, Variant, origin_of
-from orthaug.commands.kinds import kind_of
 from orthaug.commands.parts import Part
 from orthaug.commands.scales import describe_scales
 from orthaug.inference.learned_terms import equation, learned_terms
@@ -240,7 +240,7 @@ def report_of(job: Job, fit: Any) -> FitReport:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )
-    fit, fields = kind_of(job).content(job, fit, responses, warnings)
+    fit, fields = job_result.content(job, fit, responses, warnings)
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
     content = fields | {
@@ -290,7 +290,7 @@ def _over_experiments(job: Job, fit: Any, warnings: list[Any]) -> dict[str, Any]
     found = fit.over_experiments
     if found is None:
         return None
-    names = [parameter.name for parameter in fit.declared]
+    names = fit.problem.names
     doubt = differing_warning(found, names, fit.values)
     warnings.extend([] if doubt is None else [doubt])
 
@@ -304,7 +304,7 @@ def _over_experiments(job: Job, fit: Any, warnings: list[Any]) -> dict[str, Any]
         "experiments": found.experiments,
         "parameters": rows(names, found.std, found.interval, found.ratio),
     }
-    physics = getattr(job, "physics", None)
+    physics = job.physics.map
     if physics is not None:
         own = fit.physical(physics)
         over = replace(fit, covariance=found.covariance, freedom=found.freedom).physical(physics)
@@ -424,7 +424,10 @@ def judge_fit(
             )
         )
         beyond += extrapolation(
-            part.name, job.reach(model, part.record)[0], *job.reach(model, job.train.record)
+            part.name,
+            fitted.fit.reach(part.record),
+            fitted.fit.reach(job.train.record),
+            fitted.fit.layout,
         )
     return judge(trials, beyond)
 
@@ -551,7 +554,7 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
 def _draw(fitted: FitReport, folder: Path) -> None:
     from orthaug.reports import plots
 
-    drawn = kind_of(fitted.job).figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
+    drawn = job_result.figures(fitted.job, fitted.fit, fitted.result, fitted.responses)
     for name, figure in drawn.items():
         plots.save(figure, folder / f"{name}.png")
 
@@ -566,7 +569,7 @@ def fit_report(fitted: FitReport, origin: Origin | None = None) -> str:
     from orthaug.reports.page_fit import FitPage
 
     job, fit, responses = fitted.job, fitted.fit, fitted.responses
-    alone = kind_of(job).physics_alone(job, fit, responses) if fit.learns else {}
+    alone = job_result.physics_alone(job, fit, responses) if fit.learns else {}
     learned = learned_of(fit, job.train.record)
     return fit_page(
         FitPage(origin or origin_of(job, "fit"), fitted.result, responses, alone, learned)

@@ -451,7 +451,7 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:
     """Write the spec, after opening it with its data as `orthaug fit` does."""
-    from orthaug.commands.kinds import open_job
+    from orthaug.commands.opening import open_job
 
     with whole_file(out, force=force) as partial:
         partial.write_text(found.spec, encoding="utf-8")

@@ -6,14 +6,12 @@ import hashlib
 import json
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
 from orthaug import __version__
 from orthaug._base.errors import InputError, Warning, show
@@ -22,13 +20,22 @@ from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.commands.parts import Part
 from orthaug.commands.spec import Spec, load_spec
 from orthaug.data.record import Record
-from orthaug.data.regressors import Layout
 from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
+    from orthaug.analysis.design import Design
+    from orthaug.analysis.imitation import Imitation
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
+    from orthaug.fitting.structures import Structure
+    from orthaug.inference.measures import Measure
+    from orthaug.models.response import Response
+    from orthaug.models.rows import Engine
+    from orthaug.physics.parameters import PhysicsMap
+    from orthaug.reports.drawing import Figure
+    from orthaug.reports.findings import SuspectResult
     from orthaug.reports.page_fit import Origin
+    from orthaug.reports.result import CheckResult
 
 DEFAULT_BLOCKS = 4
 PHYSICS_ONLY = "physics alone"
@@ -66,8 +73,161 @@ class Variant:
 AS_DECLARED = Variant()
 
 
+P = TypeVar("P")
+"""The problem of a kind of physics."""
+F = TypeVar("F")
+"""The fit of a kind of physics."""
+
+
+class JobPhysics(ABC, Generic[P, F]):
+    """The parts of a job that depend on its physics."""
+
+    section: ClassVar[str]
+    """The section of a spec that declares it."""
+    runs_in_check: ClassVar[bool]
+    """Whether `check` computes free runs, for which JAX is needed."""
+    most_trials: ClassVar[int]
+    """Changes that advice tries: together they take about as long as the fit."""
+    map: PhysicsMap | None = None
+    """The map from physical parameters to θ, where the parameters are not physical themselves."""
+
+    @classmethod
+    @abstractmethod
+    def declare(cls, spec: Spec, step: float | None) -> Self:
+        """Return the physics of a spec, checked; `step` is the sampling time, where it is known.
+
+        Raises:
+            InputError: what the spec declares cannot be, or does not go together.
+        """
+
+    @abstractmethod
+    def rows_needed(self, spec: Spec) -> tuple[int, int]:
+        """Return the rows before the first one with a prediction, and the fewest of a stretch."""
+
+    @abstractmethod
+    def pose(self, spec: Spec, record: Record) -> P:
+        """Return the problem on a record in memory."""
+
+    def pose_part(
+        self, spec: Spec, train: Part, kind: str, engine: Engine, *, require_full_rank: bool
+    ) -> tuple[P, tuple[Warning, ...]]:
+        """Return the problem on the training data, and warnings on terms that are left out.
+
+        Rows that an engine of this kind does not hold in memory remain in their source.
+        """
+        return self.pose(spec, train.record), ()
+
+    @abstractmethod
+    def under(self, measure: Measure, spec: Spec, problem: P) -> Self:
+        """Return the physics under a measure, with the suspects of the spec, both checked."""
+
+    def check_record(self, problem: P, record: Record) -> None:
+        """Raise InputError where the problem has no value on another record."""
+        return None
+
+    @abstractmethod
+    def train(self, problem: P, **options: Any) -> F:
+        """Train a problem."""
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        """Kinds of structure that can be trained."""
+        return ("orthogonal",)
+
+    @abstractmethod
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], P], Callable[..., F]]:
+        """Return functions that pose a variant on a fold, and train it."""
+
+    def runner(self, engine: Engine) -> Any:
+        """Return the runner of independent runs."""
+        return Threads()
+
+    def without(self, problem: P, samples: Any) -> str:
+        """Return a sentence on the result of a fit without some samples; "" where that is long."""
+        return ""
+
+    @abstractmethod
+    def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
+        """Return the findings before training, and warnings on them."""
+
+    @abstractmethod
+    def refusal(self, job: Job, result: CheckResult) -> InputError | None:
+        """Return the error of parameters that the data do not determine; None where they do."""
+
+    @abstractmethod
+    def robust(self, fit: F, one_step: Response) -> F:
+        """Return the fit with the standard errors that its residual calls for."""
+
+    def describe(self, fit: F) -> dict[str, Any]:
+        """Return the section of the result that only this physics has."""
+        return {}
+
+    @abstractmethod
+    def analyse(
+        self, job: Job, fit: F, one_step: Response, free_run: Response, warnings: list[Any]
+    ) -> dict[str, Any]:
+        """Return the findings on a fit, with the `budget` of its biases; warnings are added."""
+
+    @abstractmethod
+    def shared(self, job: Job, fit: F) -> tuple[Imitation | None, list[Warning]]:
+        """Return what the learner could imitate, and warnings on what it nearly could."""
+
+    @abstractmethod
+    def figures(
+        self, job: Job, fit: F, responses: Mapping[str, tuple[Response, Response]]
+    ) -> dict[str, Figure]:
+        """Return the figures that only this physics has."""
+
+    @abstractmethod
+    def run_alone(self, fit: F, record: Record, free_run: Response) -> Response:
+        """Return the free run by the model's physics without its learner."""
+
+    @abstractmethod
+    def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
+        """Return the input that a spec asks for."""
+
+    @property
+    @abstractmethod
+    def declared_units(self) -> dict[str, str]:
+        """Units of the parameters and fixed terms, as declared, by their names."""
+
+    @abstractmethod
+    def names_taken(self, spec: Spec) -> set[str]:
+        """Return the names that a new parameter cannot have."""
+
+    @abstractmethod
+    def with_term(
+        self, job: Job, name: str, expression: str, place: str | None, initial: float
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change of a spec that adds a term, and where that is, in words.
+
+        None where the spec has the term already, or cannot have it.
+
+        Args:
+            name: of the new parameter, the term's coefficient.
+            place: the output or equation that lacks the term; None where there is one only.
+        """
+
+    def other_holds(self, spec: Spec) -> tuple[str, ...]:
+        """Return the holds of the inputs between samples that could be tried instead."""
+        return ()
+
+    def settled(self, fit: F) -> dict[str, Any]:
+        """Return the values of a spec that a fit has chosen, as a change of the spec."""
+        return {}
+
+    def explained_residual(self, fit: F) -> Callable[[SuspectResult], tuple[float, float]] | None:
+        """Return a function that gives the share of the residual that a suspect explains.
+
+        With its coefficient. None where the table of suspects says so.
+        """
+        return None
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Job(ABC):
+class Job:
     """A spec with its data read and checked: everything before training, without JAX."""
 
     path: Path
@@ -75,7 +235,14 @@ class Job(ABC):
     train: Part
     validation: Part | None
     tests: tuple[Part, ...]
+    physics: JobPhysics[Any, Any]
     problem: Any
+    measure: Measure
+    """The measure that the spec declares."""
+    engine: Engine
+    """The engine that sums over the rows."""
+    left_out: tuple[Warning, ...] = ()
+    """Warnings on terms of the learner that are left out, as they add nothing of their own."""
     checkpoints: Checkpoints | None = None
     """The folder in which the states of training are kept."""
     arguments: tuple[str, ...] = ()
@@ -83,69 +250,84 @@ class Job(ABC):
 
     def __repr__(self) -> str:
         parts = ", ".join(f"{part.name} {len(part.record)} rows" for part in self.parts)
-        return f"Job({self.path.name}: {parts}; {self.physics_in_words})"
+        return f"Job({self.path.name}: {parts}; {self.problem.physics_in_words})"
 
     @property
-    @abstractmethod
-    def physics_in_words(self) -> str:
-        """The physics in a few words."""
-
-    @property
-    @abstractmethod
     def first_row(self) -> int:
         """The first row of a recording that has a prediction."""
+        return self.problem.first_row
 
     @property
-    @abstractmethod
     def compared(self) -> tuple[str, ...]:
         """Kinds of variants that `orthaug compare` fits, physics alone first."""
+        learns = self.spec.declared_learner() is not None
+        return (PHYSICS_ONLY, *(self.physics.structures if learns else ()))
 
-    @abstractmethod
+    @property
+    def structure(self) -> Structure:
+        """The structure that the spec declares, under its measure."""
+        return self.spec.declared_structure(None, self.measure)
+
     def refusal(self, variant: Variant) -> str | None:
         """Return the reason why a variant cannot be fitted; None where it can."""
+        structure = self.spec.declared_structure(variant.structure_kind)
+        try:
+            structure.penalty(self.problem.names, self.problem.physics.initial, 1.0)
+        except InputError as error:
+            return str(error)
+        return None
 
-    @abstractmethod
     def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Any:
         """Train as the spec says, or a variant of that."""
+        if variant.fold is not None:
+            return self.fold_fit(variant)(variant.fold)
+        measure = None if variant.physics_only else self.measure
+        return self.physics.train(
+            self.problem.physics_alone() if variant.physics_only else self.problem,
+            structure=self.spec.declared_structure(variant.structure_kind, measure),
+            progress=progress,
+            engine=self.engine,
+            checkpoints=self.checkpoints,
+            **self.training_options(variant),
+        )
 
     def fold_fit(self, variant: Variant) -> Callable[[Record], Any]:
-        """Return a function that trains a variant on a fold."""
-        return lambda fold: self.run(variant.on(fold))
+        """Return a function that trains a variant on a fold.
 
-    @abstractmethod
+        It is scored by predictions, on which the measure has no effect.
+        """
+        options = self.training_options(variant.on(self.train.record))
+        options["structure"] = self.spec.declared_structure(variant.structure_kind)
+        posed, train = self.physics.fold_training(self, variant)
+        return partial(_fit_fold, posed=posed, train=train, options=options)
+
     def with_spec(self, spec: Spec) -> Job:
         """Return the job of another spec on the same data, to be fitted to folds of them.
 
         Raises:
             InputError: what the spec declares cannot be fitted to the training data.
         """
+        physics = self.physics.declare(spec, self.train.record.sampling_time)
+        problem = physics.pose(spec, self.train.record)
+        return replace(self, spec=spec, physics=physics, problem=problem, checkpoints=None)
 
     @property
     def runner(self) -> Any:
         """Runner of the independent runs of this job."""
-        return Threads()
-
-    @abstractmethod
-    def reach(self, model: Any, record: Record) -> tuple[np.ndarray, Layout]:
-        """Return the points (M, n) at which a model is evaluated on a record, and their names."""
+        return self.physics.runner(self.engine)
 
     @property
     def warnings(self) -> tuple[Warning, ...]:
-        """Warnings on what was done to the data, and which training samples are no measurements."""
-        return (*(warning for part in self.parts for warning in part.warnings), *self._of_samples)
+        """Warnings on the data, on training samples that are no measurements, on terms left out."""
+        of_parts = (warning for part in self.parts for warning in part.warnings)
+        return (*of_parts, *self._of_samples, *self.left_out)
 
     @cached_property
     def _of_samples(self) -> tuple[Warning, ...]:
         from orthaug.data.wild import data_warnings
 
-        return tuple(data_warnings(self.train.record, self.without))
-
-    def without(self, samples: Any) -> str:
-        """Return a sentence on the result of a fit without these samples of the training data.
-
-        It is "" where such a fit is expensive.
-        """
-        return ""
+        without = partial(self.physics.without, self.problem)
+        return tuple(data_warnings(self.train.record, without))
 
     @property
     def run_count(self) -> int:
@@ -155,7 +337,7 @@ class Job(ABC):
     @property
     def linear(self) -> bool:
         """True if the physics is linear in θ."""
-        return False
+        return self.problem.linear
 
     def plan_of(self, variant: Variant) -> Plan:
         """Return the known settings of each run of a variant.
@@ -221,7 +403,7 @@ class Job(ABC):
         )
 
     def training_options(self, variant: Variant) -> dict[str, Any]:
-        """Return the options of training of a variant, for either kind of physics."""
+        """Return the options of training of a variant."""
         from orthaug.fitting.training import FOLD_ITERATIONS
 
         fold, spec, training = variant.fold, self.spec, self.spec.training
@@ -231,8 +413,9 @@ class Job(ABC):
             spec.validation.blocks,
         )
         validated = self.validation is not None and fold is None
-        return {
-            "learner": None if variant.physics_only else spec.declared_learner(),
+        learner = None if variant.physics_only else spec.declared_learner()
+        options = {
+            "learner": learner,
             "criterion": variant.criterion or spec.declared_criterion(),
             "solver": solver if fold is None else solver.at_most(FOLD_ITERATIONS),
             "regularization": choices[0]
@@ -246,6 +429,16 @@ class Job(ABC):
             if validated and self.validation
             else None,
         }
+        if training.ensemble and learner is not None and fold is None:
+            options["ensemble"] = True
+        return options
+
+
+def _fit_fold(
+    fold: Record, posed: Callable[[Record], P], train: Callable[..., F], options: dict[str, Any]
+) -> F:
+    """Return the fit to a fold; a function of the module, so that it can be sent to a process."""
+    return train(posed(fold), **options)
 
 
 _YEAR_10000 = 253_402_300_800  # s since 1970

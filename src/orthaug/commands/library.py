@@ -26,16 +26,14 @@ from orthaug.commands.fit import (
 )
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
-from orthaug.commands.kinds import open_job
-from orthaug.commands.lagged_job import LaggedJob
-from orthaug.commands.motion_job import MotionJob
+from orthaug.commands.opening import job_physics, open_job
 from orthaug.commands.parts import Part
 from orthaug.commands.spec import SelectionSection, TrainingSection, ValidationSection
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.inference.measures import Training, weigh_problem
+from orthaug.inference.measures import Training
 from orthaug.models.rows import InMemory
 
 if TYPE_CHECKING:
@@ -236,8 +234,8 @@ def _write_page(text: str, path: Path | None) -> Page:
 
 def _account(fit: Estimate | MotionEstimate) -> str:
     """Return the text in the place of the spec."""
-    physics = fit.problem.motion if isinstance(fit, MotionEstimate) else fit.problem.baseline
-    declared = (fit.problem.record, physics, f"learner: {fit.model.form.bound.learner}")
+    learner = f"learner: {fit.model.form.bound.learner}"
+    declared = (fit.problem.record, fit.problem.physics, learner)
     lines = ("Fitted in Python by orthaug.estimate; there is no spec.", *map(str, declared))
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
@@ -260,12 +258,6 @@ def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
         Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ())
         for name, record in tests.items()
     )
-    measure = (
-        Training()
-        if fit.model.measure == "training"
-        else getattr(fit.measure, "measure", None) or Training()
-    )
-    if isinstance(fit, MotionEstimate):
-        return MotionJob(measure=measure, engine=InMemory(), **named)
-    weighed = weigh_problem(measure, problem)
-    return LaggedJob(weighed=weighed, physics=None, engine=InMemory(), **named)
+    measure = getattr(getattr(fit, "measure", None), "measure", None) or Training()
+    physics = job_physics(problem.physics).under(measure, named["spec"], problem)
+    return Job(physics=physics, measure=measure, engine=InMemory(), **named)

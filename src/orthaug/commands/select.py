@@ -15,7 +15,8 @@ from orthaug._base.folders import whole_folder
 from orthaug.commands.chosen_rows import parts_of, split_rows
 from orthaug.commands.data_sections import EngineSection, engine_of
 from orthaug.commands.folder import relative
-from orthaug.commands.lagged_job import LaggedJob, open_lagged
+from orthaug.commands.job import Job
+from orthaug.commands.opening import open_spec
 from orthaug.commands.spec import LearnerSection, Spec, load_spec
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
@@ -38,14 +39,14 @@ _DEGREE = 3  # of the terms to search where a spec has no [learner]
 class SelectionReport:
     """A job, its selected structure, and the result that is written."""
 
-    job: LaggedJob
+    job: Job
     selection: Selection
     result: SelectResult
     spec: str
     """The spec with the selection, for its folder."""
 
 
-def open_select(path: Path) -> tuple[LaggedJob, Spec]:
+def open_select(path: Path) -> tuple[Job, Spec]:
     """Return the job of a spec's physics alone, and the spec as it was given.
 
     Raises:
@@ -67,10 +68,10 @@ def open_select(path: Path) -> tuple[LaggedJob, Spec]:
         "engine": EngineSection(kind="memory"),
     }
     alone = spec.model_copy(update=parts)
-    return open_lagged(path, alone), spec
+    return open_spec(path, alone), spec
 
 
-def select_for(job: LaggedJob, spec: Spec, folder: Path, report_model: OnStage) -> SelectionReport:
+def select_for(job: Job, spec: Spec, folder: Path, report_model: OnStage) -> SelectionReport:
     """Select the structure, and write the choice into the spec.
 
     Args:
@@ -158,7 +159,7 @@ def _criterion(spec: Spec) -> Criterion:
     return spec.training.declared(CRITERIA, focus)
 
 
-def _result(job: LaggedJob, selection: Selection, seconds: float) -> SelectResult:
+def _result(job: Job, selection: Selection, seconds: float) -> SelectResult:
     orders, test, learner = selection.orders.chosen, selection.nonlinearity, selection.learner
     shares, physics, confirmed = selection.shares, selection.physics, selection.confirmed
     rates = {} if selection.terms is None else selection.terms.rates()
@@ -228,7 +229,7 @@ def _learner_section(learner: Learner | None) -> dict[str, Any] | None:
     return {"kind": "mlp", "hidden": list(learner.hidden), "activation": learner.activation} | seen  # type: ignore[attr-defined]
 
 
-def _new_spec(job: LaggedJob, folder: Path, selection: Selection, parts: Parts) -> str:
+def _new_spec(job: Job, folder: Path, selection: Selection, parts: Parts) -> str:
     """Return the spec with the choice in it.
 
     Comments and order are kept, paths made relative to the new folder.
@@ -259,9 +260,7 @@ def _new_spec(job: LaggedJob, folder: Path, selection: Selection, parts: Parts) 
     return head + tomlkit.dumps(document)
 
 
-def _say_rows(
-    document: Any, job: LaggedJob, folder: Path, selection: Selection, parts: Parts
-) -> None:
+def _say_rows(document: Any, job: Job, folder: Path, selection: Selection, parts: Parts) -> None:
     """Write which rows chose the terms, and have the others fitted."""
     section = document.setdefault("selection", tomlkit.table())
     section.pop("chosen_on", None)
@@ -279,7 +278,7 @@ def _say_rows(
     section["chosen_on"].comment("where `data.train` has rows of these, a fit has no intervals")
 
 
-def _relative_files(folder: Path, job: LaggedJob, files: Sequence[str]) -> list[str]:
+def _relative_files(folder: Path, job: Job, files: Sequence[str]) -> list[str]:
     """Return files of the job's spec as seen from another folder."""
     old = job.path.parent
     return [file if Path(file).is_absolute() else relative(old / file, folder) for file in files]

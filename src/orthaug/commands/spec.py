@@ -8,15 +8,15 @@ what was expected.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, create_model, model_validator
 
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.registry import resolve
 from orthaug.commands.data_sections import Data, EngineSection, MotionSection, Range
 from orthaug.commands.sections import (
@@ -41,7 +41,7 @@ from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
-from orthaug.models.terms import over_lags, over_states
+from orthaug.models.terms import over_lags
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.parameters import PhysicsMap
@@ -51,6 +51,7 @@ Regularization = (
     Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 )
 
+_SECTIONS = {"learner": "learner", "kind": "structure.kind"}  # of keys that are not in [training]
 _BESIDE_MOTION = {
     "baseline": "expected one of them, because both are the physics",
     "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
@@ -88,8 +89,22 @@ class TermSection(Section):
 class BaselineSection(Section):
     """The physics."""
 
+    learns: ClassVar[bool] = True
+    reads_all_rows: ClassVar[str] = ""
+    foreign_keys: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("equation", "factor", "unit"), "without [motion], which it belongs to"
+    )
     terms: Annotated[list[TermSection], Field(min_length=1)]
     constants: dict[str, Finite] = {}
+
+    def over(self, learner: Any, spec: Spec) -> Learner:
+        """Return a learner of terms over the lags of a spec."""
+        channels = tuple(spec.data.outputs), tuple(spec.data.inputs)
+        return over_lags(learner, spec.declared_baseline(), spec.lag_orders(), *channels)
+
+    def criterion(self, training: TrainingSection) -> Criterion:
+        """Return the criterion of a spec."""
+        return resolve(training.declared(CRITERIA, training.chosen_focus()))
 
 
 class PhysicsSection(Section):
@@ -246,15 +261,10 @@ class Spec(Section):
         for name in ("baseline", "lags", "physics") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
-        wrong = {"output"} if self.motion is not None else {"equation", "factor", "unit"}
+        wrong = self.declared_physics.foreign_keys
         for i, section in enumerate(self.suspects):
-            for key in sorted(section.model_fields_set & wrong):
-                found = (
-                    "beside [motion]; expected `equation`"
-                    if self.motion
-                    else "without [motion], which it belongs to"
-                )
-                raise ValueError(f"`suspects[{i}].{key}`: found {found}")
+            for key in sorted(section.model_fields_set & wrong.keys()):
+                raise ValueError(f"`suspects[{i}].{key}`: found {wrong[key]}")
         if self.motion is not None and self.training.ensemble:
             raise ValueError(
                 "`training.ensemble`: a motion has none, because medians of runs follow no "
@@ -279,6 +289,13 @@ class Spec(Section):
                 "`validation.blocks` to choose by"
             )
         return self
+
+    @property
+    def declared_physics(self) -> BaselineSection | MotionSection:
+        """The section that declares the physics: there is one of the two."""
+        section = self.motion or self.baseline
+        assert section is not None
+        return section
 
     def channels(self, names: list[str]) -> tuple[Channel, ...]:
         """Return the named channels with unit, column, scale and offset."""
@@ -321,19 +338,11 @@ class Spec(Section):
 
     def declared_learner(self) -> Learner | None:
         """Return the learner; None for physics alone, as of a motion with no learned part."""
-        if (
-            self.motion is not None
-            and not self.motion.learns
-            and "learner" not in self.model_fields_set
-        ):
+        section = self.declared_physics
+        if not section.learns and "learner" not in self.model_fields_set:
             return None
         learner = resolve(self.learner.declared(LEARNERS, self.learner.kind))
-        if not hasattr(learner, "over"):
-            return learner
-        if self.motion is not None:
-            return over_states(learner, self.motion.motion_of(self.data.inputs, self.data.outputs))
-        channels = tuple(self.data.outputs), tuple(self.data.inputs)
-        return over_lags(learner, self.declared_baseline(), self.lag_orders(), *channels)
+        return section.over(learner, self) if hasattr(learner, "over") else learner
 
     def learner_inputs(self) -> tuple[str, ...] | None:
         """Return the learner's inputs; None for all lags."""
@@ -356,16 +365,8 @@ class Spec(Section):
         return resolve(section.declared(MEASURES, section.kind), place)
 
     def declared_criterion(self) -> Criterion:
-        """Return the criterion.
-
-        A motion is trained on its free run, from starts that are estimated: without a washout.
-        """
-        training = self.training
-        if self.motion is None:
-            return resolve(training.declared(CRITERIA, training.chosen_focus()))
-        focus = "simulation" if training.focus == "auto" else training.focus
-        washout = {} if "washout" in training.model_fields_set else {"washout": 0}
-        return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
+        """Return the criterion."""
+        return self.declared_physics.criterion(self.training)
 
     def declared_solver(self) -> Solver:
         """Return the solver."""
@@ -381,7 +382,7 @@ class Spec(Section):
             return self.engine.chosen(files)
         if self.engine.kind == "stream":
             what = (
-                "`training.segment` = 0, whole experiments," if self.motion is None else "a motion"
+                self.declared_physics.reads_all_rows or "`training.segment` = 0, whole experiments,"
             )
             raise InputError(
                 f"`engine.kind`: found stream; expected memory, devices or dask: {what} reads "
@@ -393,7 +394,8 @@ class Spec(Section):
     def brought(self) -> bool:
         """True if training reads all rows into memory."""
         free_run = self.declared_criterion().free_run
-        return self.motion is not None or (free_run is not None and not free_run.steps)
+        whole = free_run is not None and not free_run.steps
+        return bool(self.declared_physics.reads_all_rows) or whole
 
     def regularizations(
         self, *, linear: bool, validated: bool, kind: str | None = None
@@ -420,6 +422,11 @@ class Spec(Section):
         return self.training.restarts * len(
             self.regularizations(linear=linear, validated=validated)
         )
+
+
+def spec_error(error: KeyedError) -> InputError:
+    """Return an error in one key of a declaration in the words of a spec."""
+    return InputError(f"'{_SECTIONS.get(error.key, f'training.{error.key}')}'{error.words}.")
 
 
 def spec_model() -> type[Spec]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -52,7 +52,7 @@ from orthaug.inference.splitting import (
 )
 from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics, half_inverse
-from orthaug.physics.baseline import Parameter, check_sampling_constant
+from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
@@ -179,6 +179,22 @@ class AnyFit(FitView):
         half = half_inverse(information[np.ix_(free, free)], int(free[: len(self.theta)].sum()))
         return -scores[:, free] @ half @ (half.T @ k[:, free].T) * _left_out(len(scores))
 
+    def withheld(self, kind: str, why: Warning) -> Any:
+        """Return the fit without standard errors and intervals of θ, terms and predictions.
+
+        A warning says why.
+        """
+        fit: Any = self
+        statistics = replace(fit.model.statistics, middle=None)
+        return replace(
+            fit,
+            model=replace(fit.model, statistics=statistics),
+            covariance=None,
+            plain_covariance=None,
+            std_kind=kind,
+            warnings=(*fit.warnings, why),
+        )
+
     def lines(self) -> list[str]:
         """Return the lines of `summary` before its warnings."""
         raise NotImplementedError
@@ -233,14 +249,6 @@ class Estimate(AnyFit):
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
 
-    lagged: ClassVar[bool] = True
-    """Whether the model predicts from lagged signals, so that it has a residual one step ahead."""
-
-    @property
-    def declared(self) -> tuple[Parameter, ...]:
-        """The declared parameters, in the order of θ."""
-        return self.problem.baseline.parameters
-
     @property
     def values(self) -> Vector:
         """The parameters' values: θ̂ (nθ,)."""
@@ -253,7 +261,8 @@ class Estimate(AnyFit):
 
     def reach(self, record: Record) -> Matrix:
         """Return the regressors (N, nx) of a record in the model's order of channels."""
-        return lag_rows(record, self.problem.layout)
+        own = record is self.problem.record
+        return self.problem.rows.x if own else lag_rows(record, self.problem.layout)
 
     @property
     def one_step_theta(self) -> Vector | None:
@@ -269,6 +278,15 @@ class Estimate(AnyFit):
     def std(self) -> Vector | None:
         """Standard errors of θ̂ (nθ,)."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+    @property
+    def plain_std(self) -> Vector | None:
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
+        """
+        plain = self.plain_covariance
+        return None if plain is None else np.sqrt(np.diag(plain))
 
     @property
     def interval(self) -> Matrix | None:
@@ -338,20 +356,7 @@ class Estimate(AnyFit):
         )
 
     def withheld(self, kind: str, why: Warning) -> Estimate:
-        """Return the fit without standard errors and intervals of θ, terms and predictions.
-
-        A warning says why.
-        """
-        statistics = replace(self.model.statistics, middle=None)
-        return replace(
-            self,
-            model=replace(self.model, statistics=statistics),
-            covariance=None,
-            plain_covariance=None,
-            plain_statistics=None,
-            std_kind=kind,
-            warnings=(*self.warnings, why),
-        )
+        return replace(super().withheld(kind, why), plain_statistics=None)
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.

@@ -15,9 +15,16 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import STD_KINDS, AnyFit, Restart, parameter_frame, parameter_lines
+from orthaug.fitting.estimates import (
+    STD_KINDS,
+    WITHHELD,
+    AnyFit,
+    Restart,
+    parameter_frame,
+    parameter_lines,
+)
+from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
-from orthaug.fitting.motion_measures import field_under, wobble
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines
@@ -39,8 +46,8 @@ from orthaug.models.motion_field import parts_at
 from orthaug.models.motion_model import MotionModel
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
-from orthaug.physics.motion_problem import MotionProblem, layout_of
-from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.excitation import Excitation, of_gram
+from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections
 
@@ -101,17 +108,22 @@ class MotionEstimate(AnyFit):
     """The estimate of physics alone that the learner had to beat; None without a learner."""
     warnings: tuple[Warning, ...] = ()
 
-    lagged: ClassVar[bool] = False
+    one_step_theta: ClassVar[None] = None
+    """A motion has no least squares one step ahead."""
 
     @property
-    def declared(self) -> tuple[PhysicalParameter, ...]:
-        """The declared parameters, in the order of p̂."""
-        return self.problem.motion.parameters
+    def excitation(self) -> Excitation:
+        """Rank and condition of the parameters in the outputs of the fitted motion."""
+        names, gram = self.problem.names, self.model.statistics.gram
+        count = len(names)
+        if gram is None:
+            return Excitation(0, count, None, ())
+        return of_gram(gram[:count, :count], names)
 
     @property
     def layout(self) -> Layout:
         """Names of the entries of `reach`."""
-        return layout_of(self.problem.motion)
+        return self.problem.layout
 
     def reach(self, record: Record) -> Matrix:
         """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
@@ -334,7 +346,7 @@ def _with_split(
         fit,
         model=model,
         covariance=None
-        if fit.std_kind == "none"
+        if fit.std_kind in WITHHELD
         else enlarge_covariance(covariance, fit.model.statistics, split.shared),
         defect=split.defect,
         split_by=split,

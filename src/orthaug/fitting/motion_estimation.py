@@ -103,14 +103,6 @@ def fit_motion(
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
 
-def without_learner(problem: MotionProblem) -> MotionProblem:
-    """Return the problem with no state and no output learned."""
-    motion = problem.motion
-    states = tuple(replace(state, learned=False) for state in motion.states)
-    outputs = tuple(replace(output, learned=False) for output in motion.outputs)
-    return replace(problem, motion=replace(motion, states=states, outputs=outputs))
-
-
 _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
 _TRIED_ROWS = 1000  # on which windows are compared
 

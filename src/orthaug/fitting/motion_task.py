@@ -17,9 +17,9 @@ from orthaug._base.checks import Vector
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.field_points import sizes_learned
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
-from orthaug.fitting.motion_measures import sizes_learned
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit

@@ -16,7 +16,7 @@ from orthaug.fitting.residual_band import Reference, ResidualMonitor
 from orthaug.models import storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.storage import pack, read_packed, write_packed
+from orthaug.models.packed_files import pack, read_packed, write_packed
 from orthaug.physics.baseline import Baseline
 
 FORMAT = 1

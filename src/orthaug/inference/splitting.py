@@ -7,7 +7,6 @@ measure θ depends on the learner, and shares its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -102,7 +101,7 @@ def split_by_measure(
     left = projection.along(model.shared) @ projection.coordinates(rest)
     defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    warnings = warn_beyond_data(measure, share, form, "θ depends")
+    warnings = beyond_data(measure, share) if form.learns else ()
     condition = weighed.excitation.condition
     of_measure = (share, len(points.x), condition, warnings)
     return MeasureSplit(
@@ -110,18 +109,13 @@ def split_by_measure(
     )
 
 
-def warn_beyond_data(measure: Measure, share: float, form: Any, what: str) -> tuple[Warning, ...]:
-    """Return the warning that a learner extrapolates over most of a measure, or none.
-
-    Args:
-        share: of the measure within reach of the training data.
-        what: what depends on the learner there, with its verb.
-    """
-    if share >= _SUPPORTED or not form.learns:
+def beyond_data(measure: Measure, share: float) -> tuple[Warning, ...]:
+    """Return a warning where the data support too small a `share` of a measure."""
+    if share >= _SUPPORTED:
         return ()
     text = (
         f"only {100 * share:.0f} % of the {measure.name} measure lies within reach of the "
-        f"training data: elsewhere {what} on the learner's extrapolation."
+        "training data: elsewhere the parameters depend on the learner's extrapolation."
     )
     return (Warning("measure_beyond_data", text),)
 

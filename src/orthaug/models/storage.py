@@ -1,39 +1,451 @@
-"""Models on disk: `model.json` for what a model is, `arrays.safetensors` for its numbers.
+"""Saved models: `model.json` for what a model is, `arrays.safetensors` for its numbers.
 
-The files hold nothing executable.
-
-The JSON carries checksums of itself and of the arrays. A file that was cut or altered is refused.
-`pack` writes other content the same way.
+Every model has channels, numbers, statistics of training and a learner. Its physics are terms on
+lagged signals, or equations of motion as text. A file holds neither kind nor fields of a callable.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
+import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as save_arrays
 
-from orthaug import __version__
 from orthaug._base.checks import check_type, is_number
 from orthaug._base.errors import InputError, show
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
-from orthaug.models import lagged_storage, motion_storage
-from orthaug.models.learners import Learner
+from orthaug._base.registry import freeze
+from orthaug.data.expressions import Expression, Lag, parse_named
+from orthaug.data.record import Channel, Preparation
+from orthaug.data.regressors import Features
+from orthaug.models.dynamics import Numbers
+from orthaug.models.kinds import LEARNERS
+from orthaug.models.lagged import LaggedDynamics
+from orthaug.models.learners import Bound, Learner, nothing_learned
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
-from orthaug.physics.baseline import Baseline
-from orthaug.physics.motion import Motion
+from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.packed_files import pack, read_packed, write_packed
+from orthaug.models.statistics import Statistics
+from orthaug.physics.baseline import Baseline, Parameter, Term
+from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.parameters import PhysicalParameter
 
+FORMAT = 2
+_DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
 _LONGEST_LAG = 1_000_000  # rows: a state has an entry for each
+_WORDS = ("structure", "measure", "sampling_time", "time_column")  # of every model, as they are
+_LIMITS = {"min": -math.inf, "max": math.inf}
+_SEGMENTATION = ("segment", "washout", "rows")  # of `TrainedSegments`
+_ON_SEGMENTS = ("states", "alone", "slope")
+
+
+def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
+    """Write a model to a folder of its own, whole or not at all.
+
+    A model that `save` wrote there before is replaced.
+
+    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can;
+    `load` asks for the callable.
+
+    Args:
+        model: what to write.
+        folder: a new one, or one that holds a saved model.
+        force: replace the folder whatever it holds.
+
+    Raises:
+        InputError: the folder cannot be written, or holds something else.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
+        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> fit = oa.estimate(record, physics, learner=None)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(fit.model, Path(folder, "model"))
+        ...     load(Path(folder, "model"))
+        Model(orthogonal, θ: gain, learner: none)
+    """
+    with whole_folder(Path(folder), force=force) as partial:
+        write(model, partial)
+
+
+def write(model: Model | MotionModel, folder: Path) -> None:
+    """Write the two files into an existing folder."""
+    write_packed(_pack(model), folder / _DECLARATION, folder / _ARRAYS)
+
+
+def digest(model: Model | MotionModel) -> str:
+    """Return the sha256 that identifies a model: `checksum` in the file of this version."""
+    return _pack(model)[0]["checksum"]
+
+
+def _pack(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
+    """Return the contents of the two files."""
+    return pack(FORMAT, *_declare(model))
+
+
+def load(
+    folder: str | Path, *, baseline: Baseline | Motion | None = None, learner: Learner | None = None
+) -> Model | MotionModel:
+    """Read a model that `save` or `orthaug fit` wrote.
+
+    Args:
+        folder: the model's folder, or the result folder that holds it as `model/`.
+        baseline, learner: the Python callables again, where the saved model had such; a motion
+            counts as a baseline.
+
+    Raises:
+        InputError: no model there; a file that is cut, altered, or from a newer version.
+    """
+    check_type(folder, str | os.PathLike, "folder", "a folder's name")
+    folder = Path(folder)
+    try:
+        if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
+            folder = folder / "model"
+        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    except ValueError:  # a NUL byte in the name
+        there = False
+    if not there:
+        raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
+    declared, arrays = read_packed(
+        folder / _DECLARATION, folder / _ARRAYS, FORMAT, "model", "fit again, or copy it again"
+    )
+    path = folder / _DECLARATION
+    try:
+        model = _rebuild(declared, arrays, baseline, learner, path)
+        check_loaded(model, path)
+        return model
+    except InputError:
+        raise
+    except (
+        Exception
+    ) as error:  # the checksum holds, so someone made it: there is no list of what that can hold
+        raise InputError(
+            f"{path}: not a model of this version (missing or misplaced: {error})."
+        ) from None
+
+
+def _declare(model: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return the declaration of a model, and its arrays; arrays that are None are left out."""
+    kind = next(name for name, physics in _PHYSICS.items() if type(model) is physics.model)
+    kept, form = model.statistics, model.form
+    of_form, of_training, own_arrays = _PHYSICS[kind].declare(model)
+    declared = {"kind": kind} if kind != _FIRST else {}
+    declared |= {name: getattr(model, name) for name in _WORDS}
+    declared |= {
+        group: [asdict(channel) for channel in getattr(model, group)]
+        for group in ("outputs", "inputs")
+    }
+    declared |= {"flown": kept.simulated, "verdict": kept.verdict}
+    if model.prepared:
+        declared["prepared"] = [asdict(step) for step in model.prepared]
+    declared |= of_form | {"learner": _declare_bound(form.bound)} | of_training
+    arrays = {f"numbers.{name}": value for name, value in model.numbers._asdict().items()}
+    arrays |= {
+        "largest_output": model.largest_output,
+        "deviation": model.deviation,
+        "output_weight": model.weight,
+        "scalars": np.array([0.0 if np.ndim(kept.ridge) else kept.ridge, kept.freedom]),
+        "gram": kept.gram,
+        "noise": kept.noise,
+        "middle": kept.middle,
+        "disturbance": kept.disturbance,
+        "sensor": kept.sensor,
+        "ridge": kept.ridge if np.ndim(kept.ridge) else None,
+        **own_arrays,
+    }
+    return declared, {
+        name: np.asarray(value) for name, value in arrays.items() if value is not None
+    }
+
+
+def _rebuild(
+    declared: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    given: Any,
+    learner: Learner | None,
+    path: Path,
+) -> Any:
+    """Return the model that a file declares.
+
+    Raises:
+        InputError: a callable is asked for.
+    """
+    kind = _PHYSICS[declared.get("kind", _FIRST)]
+    physics = kind.rebuild(declared, given, path)
+    weights = arrays.get("numbers.weights", np.zeros(0))
+    outputs = len(declared["outputs"]) if kind.adds_to_outputs else 0
+    bound = _rebuild_bound(declared["learner"], weights, learner, outputs, path)
+    channels = {
+        group: tuple(Channel(**channel) for channel in declared[group])
+        for group in ("outputs", "inputs")
+    }
+    statistics = Statistics(
+        gram=arrays.get("gram"),
+        middle=arrays.get("middle"),
+        noise=arrays.get("noise"),
+        ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
+        freedom=float(arrays["scalars"][1]),
+        simulated=bool(declared.get("flown", kind.model is MotionModel)),
+        verdict=str(declared.get("verdict", "")),
+        disturbance=arrays.get("disturbance"),
+        sensor=arrays.get("sensor"),
+    )
+    # models that weighed every output by itself kept `weight`, the inverse of the deviation
+    return kind.model(
+        numbers=Numbers(
+            **{n: arrays.get(f"numbers.{n}") for n in Numbers._fields}  # type: ignore[arg-type]
+        ),
+        statistics=statistics,
+        **{name: declared[name] for name in _WORDS},
+        **channels,
+        largest_output=arrays["largest_output"],
+        deviation=arrays["deviation"] if "deviation" in arrays else 1 / arrays["weight"],
+        weight=arrays["output_weight"] if "output_weight" in arrays else np.diag(arrays["weight"]),
+        prepared=tuple(Preparation(**step) for step in declared.get("prepared", ())),
+        **kind.fields(declared, arrays, physics, bound),
+    )
+
+
+class _Physics(NamedTuple):
+    """The part of a file that depends on the kind of physics."""
+
+    model: Callable[..., Any]
+    declare: Callable[[Any], tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]
+    """Returns the form and the training as a file declares them, and their arrays."""
+    rebuild: Callable[[dict[str, Any], Any, Path], Any]
+    """Returns the physics that a file declares; of a callable the given one."""
+    fields: Callable[[dict[str, Any], dict[str, np.ndarray], Any, Bound], dict[str, Any]]
+    """Returns the form and the other fields that only these models have."""
+    adds_to_outputs: bool
+    """Whether a learner adds to every output."""
+
+
+def _declare_lagged(model: Model) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    form, baseline = model.form, model.form.baseline
+    declared = {
+        "layout": [list(lag) for lag in form.layout],
+        "features": [
+            {"text": e.text, "constants": dict(e.constants)} for e in form.features.entries
+        ],
+        "baseline": {
+            "kind": "terms" if baseline.function is None else "callable",
+            "parameters": [asdict(parameter) for parameter in baseline.parameters],
+            "terms": [asdict(term) for term in baseline.terms],
+            "constants": dict(baseline.constants),
+        },
+    }
+    return declared, {}, {"shared": model.shared}
+
+
+def _rebuild_baseline(declared: dict[str, Any], given: Any, path: Path) -> Baseline:
+    physics = declared["baseline"]
+    if physics["kind"] == "terms":
+        terms = [Term(**term) for term in physics["terms"]]
+        return Baseline.from_terms(terms, physics["constants"])
+    if given is None:
+        raise InputError(
+            f"{path}: the baseline was a Python function; give it again, load(…, baseline=…)."
+        )
+    return replace(given, parameters=tuple(Parameter(**p) for p in physics["parameters"]))
+
+
+def _lagged_fields(
+    declared: dict[str, Any], arrays: dict[str, np.ndarray], baseline: Baseline, bound: Bound
+) -> dict[str, Any]:
+    entries = tuple(
+        Expression(e["text"], tuple(e["constants"].items()))
+        for e in declared["features"][: bound.nz]
+    )
+    form = LaggedDynamics(
+        baseline,
+        Features(entries, bound.linear),
+        tuple(Lag(*lag) for lag in declared["layout"]),
+        tuple(channel["name"] for channel in declared["outputs"]),
+        bound,
+    )
+    return {"form": form, "shared": arrays.get("shared")}
+
+
+def _declare_motion(model: MotionModel) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    form, motion, trained = model.form, model.form.motion, model.trained
+    parameters = []
+    for parameter in motion.parameters:
+        entry = asdict(parameter)
+        parameters.append(entry | {k: None for k, limit in _LIMITS.items() if entry[k] == limit})
+    of_form = {
+        "motion": {
+            "kind": "equations" if motion.functions is None else "callable",
+            "states": [asdict(state) for state in motion.states],
+            "outputs": [asdict(output) for output in motion.outputs],
+            "inputs": list(motion.inputs),
+            "parameters": parameters,
+            "constants": dict(motion.constants),
+            "define": {name: expression.text for name, expression in motion.definitions},
+            "integrator": motion.integrator,
+            "substeps": motion.substeps,
+            "hold": motion.hold,
+        },
+        "features": [entry.text for entry in form.features],
+    }
+    of_training: dict[str, Any] = {
+        "substeps": form.substeps,
+        "window": model.window,
+        "trained": None,
+    }
+    arrays = {"loose": model.loose, "seen": model.seen}
+    if trained is not None:
+        of_training["trained"] = {key: getattr(trained, key) for key in _SEGMENTATION}
+        arrays |= {f"trained.{key}": getattr(trained, key) for key in _ON_SEGMENTS}
+    return of_form, of_training, arrays
+
+
+def _rebuild_motion(declared: dict[str, Any], given: Any, path: Path) -> Motion:
+    kept = declared["motion"]
+    parameters = [
+        PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))
+        for p in kept["parameters"]
+    ]
+    states, outputs = [State(**s) for s in kept["states"]], [Output(**o) for o in kept["outputs"]]
+    options = {name: kept[name] for name in ("integrator", "substeps", "hold")}
+    if kept["kind"] == "equations":
+        named = {"constants": kept["constants"], "define": kept["define"]}
+        return Motion.from_equations(
+            states, outputs, parameters, kept["inputs"], **named, **options
+        )
+    if not isinstance(given, Motion) or given.functions is None:
+        raise InputError(
+            f"{path}: the motion was two Python functions; give them again, load(…, "
+            "baseline=Motion…)."
+        )
+    if given.names_of_states != tuple(s.name for s in states) or given.names != tuple(
+        p.name for p in parameters
+    ):
+        raise InputError(
+            f"{path}: the saved motion has the states {', '.join(s.name for s in states)} and "
+            f"the parameters {', '.join(p.name for p in parameters)}; give the same one."
+        )
+    return replace(
+        given,
+        parameters=tuple(parameters),
+        constants=tuple(kept["constants"].items()),
+        states=tuple(states),
+        outputs=tuple(outputs),
+        inputs=tuple(kept["inputs"]),
+        **options,
+    )
+
+
+def _motion_fields(
+    declared: dict[str, Any], arrays: dict[str, np.ndarray], motion: Motion, bound: Bound
+) -> dict[str, Any]:
+    form = MotionDynamics(
+        motion=motion,
+        features=tuple(
+            parse_named(text, motion.known, "learner input") for text in declared["features"]
+        ),
+        bound=bound,
+        sampling_time=float(declared["sampling_time"]),
+        substeps=int(declared["substeps"]),
+    )
+    kept, trained = declared["trained"], None
+    if kept is not None:
+        own: dict[str, Any] = {key: int(kept[key]) for key in _SEGMENTATION}
+        own |= {key: arrays.get(f"trained.{key}") for key in _ON_SEGMENTS}
+        trained = TrainedSegments(**own)
+    return {
+        "form": form,
+        "loose": arrays["loose"],
+        "window": int(declared["window"]),
+        "trained": trained,
+        "seen": arrays.get("seen"),
+    }
+
+
+_FIRST = "lagged"  # a file of this kind does not name it: once there was no other
+_PHYSICS = {
+    _FIRST: _Physics(Model, _declare_lagged, _rebuild_baseline, _lagged_fields, True),
+    "motion": _Physics(MotionModel, _declare_motion, _rebuild_motion, _motion_fields, False),
+}
+
+
+def _declare_bound(bound: Bound) -> dict[str, Any] | None:
+    """Return the declaration of a learner; None without one."""
+    if not bound.learns:
+        return None
+    return _declare_learner(bound.learner) | {"nz": bound.nz, "ny": bound.ny}
+
+
+def _declare_learner(learner: Learner) -> dict[str, Any]:
+    """Return kind and fields of a learner."""
+    kind = LEARNERS.kind_of(learner)
+    if kind is None:
+        return {"kind": "callable"}
+    return {"kind": kind} | {name: getattr(learner, name) for name in _field_names(type(learner))}
+
+
+def _rebuild_learner(kept: dict[str, Any], given: Learner | None, path: Path) -> Learner:
+    """Return the learner that a file declares.
+
+    For a callable it is the given one.
+    """
+    kind = kept["kind"]
+    if kind in LEARNERS:
+        learner = LEARNERS[kind]
+        return learner(
+            **{name: freeze(kept[name]) for name in _field_names(learner) if name in kept}
+        )
+    if given is not None:
+        return given
+    if kind != "callable":
+        raise InputError(
+            f"{path}: its learner is of the kind '{kind}', which is not registered here; "
+            "register it, or give the learner, load(…, learner=…)."
+        )
+    raise InputError(
+        f"{path}: the learner was a Python callable; give it again, load(…, learner=…)."
+    )
+
+
+def _field_names(learner: type) -> list[str]:
+    return [field.name for field in fields(learner) if field.init]
+
+
+def _rebuild_bound(
+    kept: dict[str, Any] | None,
+    weights: np.ndarray,
+    given: Learner | None,
+    outputs: int,
+    path: Path,
+) -> Bound:
+    """Return the learner that a file declares with its sizes.
+
+    Args:
+        outputs: to which nothing is added where the file declares no learner.
+
+    Raises:
+        InputError: a learner that is not known here, or has another number of weights.
+    """
+    if kept is None:
+        return nothing_learned(outputs)
+    bound = Bound(_rebuild_learner(kept, given, path), kept["nz"], kept["ny"])
+    saved = weights.shape[-1]
+    if bound.size != saved:
+        raise InputError(
+            f"{path}: the learner has {bound.size} weights, the saved one {saved}; give the "
+            "same one."
+        )
+    return bound
 
 
 def check_loaded(model: Any, path: Path) -> None:
@@ -125,170 +537,3 @@ def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | N
     ):
         if value is not None:
             yield name, value, shape
-
-
-FORMAT = 2
-_DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"
-_KINDS: dict[type, ModuleType] = {Model: lagged_storage, MotionModel: motion_storage}
-
-
-def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
-    """Write a model to a folder of its own, whole or not at all.
-
-    A model that `save` wrote there before is replaced.
-
-    A baseline, motion or learner that is a Python callable cannot be written. Its numbers can;
-    `load` asks for the callable.
-
-    Args:
-        model: what to write.
-        folder: a new one, or one that holds a saved model.
-        force: replace the folder whatever it holds.
-
-    Raises:
-        InputError: the folder cannot be written, or holds something else.
-
-    Examples:
-        >>> import tempfile
-        >>> import numpy as np
-        >>> import orthaug as oa
-        >>> record = oa.Record.from_arrays(u=np.sin(np.arange(50.0)), y=2 * np.sin(np.arange(50.0)))
-        >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
-        >>> fit = oa.estimate(record, physics, learner=None)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(fit.model, Path(folder, "model"))
-        ...     load(Path(folder, "model"))
-        Model(orthogonal, θ: gain, learner: none)
-    """
-    with whole_folder(Path(folder), force=force) as partial:
-        write(model, partial)
-
-
-def write(model: Model | MotionModel, folder: Path) -> None:
-    """Write the two files into an existing folder."""
-    write_packed(_pack(model), folder / _DECLARATION, folder / _ARRAYS)
-
-
-def digest(model: Model | MotionModel) -> str:
-    """Return the sha256 that identifies a model: `checksum` in the file of this version."""
-    return _pack(model)[0]["checksum"]
-
-
-def _pack(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
-    """Return the contents of the two files."""
-    kind = _KINDS[type(model)]
-    declared, arrays = kind.declare(model)
-    return pack(FORMAT, declared, arrays)
-
-
-def load(
-    folder: str | Path, *, baseline: Baseline | Motion | None = None, learner: Learner | None = None
-) -> Model | MotionModel:
-    """Read a model that `save` or `orthaug fit` wrote.
-
-    Args:
-        folder: the model's folder, or the result folder that holds it as `model/`.
-        baseline, learner: the Python callables again, where the saved model had such; a motion
-            counts as a baseline.
-
-    Raises:
-        InputError: no model there; a file that is cut, altered, or from a newer version.
-    """
-    check_type(folder, str | os.PathLike, "folder", "a folder's name")
-    folder = Path(folder)
-    try:
-        if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
-            folder = folder / "model"
-        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
-    except ValueError:  # a NUL byte in the name
-        there = False
-    if not there:
-        raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
-    declared, arrays = read_packed(
-        folder / _DECLARATION, folder / _ARRAYS, FORMAT, "model", "fit again, or copy it again"
-    )
-    path = folder / _DECLARATION
-    try:
-        kind = motion_storage if declared.get("kind") == "motion" else lagged_storage
-        model = kind.rebuild(declared, arrays, baseline, learner, path)
-        check_loaded(model, path)
-        return model
-    except InputError:
-        raise
-    except (
-        Exception
-    ) as error:  # the checksum holds, so someone made it: there is no list of what that can hold
-        raise InputError(
-            f"{path}: not a model of this version (missing or misplaced: {error})."
-        ) from None
-
-
-def pack(
-    number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]
-) -> tuple[dict[str, Any], bytes]:
-    """Return the contents of the two files in the format of this `number`."""
-    packed = save_arrays(
-        {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in arrays.items()}
-    )
-    declaration = {"format": number, "orthaug": __version__, **declared} | {
-        "arrays_sha256": hashlib.sha256(packed).hexdigest()
-    }
-    return declaration | {"checksum": _checksum(declaration)}, packed
-
-
-def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path) -> None:
-    """Write the declaration to `path`, the arrays beside it."""
-    arrays.write_bytes(packed[1])
-    path.write_text(json.dumps(packed[0], indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def read_packed(
-    path: Path, arrays: Path, number: int, what: str, again: str
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read the declaration and the arrays.
-
-    Args:
-        number: the newest format that is read.
-        what: the name of the content, such as "model".
-        again: what to do where a file is damaged, in words.
-
-    Raises:
-        InputError: files that are cut, altered, of a newer version, or something else.
-    """
-    try:
-        declared, packed = json.loads(path.read_text(encoding="utf-8")), arrays.read_bytes()
-        given = declared.pop("checksum", None) if isinstance(declared, dict) else None
-        checksum = _checksum(declared)
-    except OSError as error:
-        raise InputError(f"{path.parent}: cannot be read ({error.strerror}).") from None
-    except (ValueError, RecursionError):
-        raise InputError(f"{path}: the file is cut or altered (no JSON); {again}.") from None
-    if (
-        not isinstance(declared, dict)
-        or type(declared.get("format")) is not int
-        or declared["format"] < 1
-    ):
-        raise InputError(f"{path}: not a {what} of orthaug.")
-    if declared["format"] > number:
-        raise InputError(
-            f"{path}: written by orthaug {declared.get('orthaug')} in format "
-            f"{declared['format']}; this version ({__version__}) reads up to {number}. Update "
-            "orthaug."
-        )
-    if given != checksum:
-        raise InputError(f"{path}: the file was altered (its checksum differs); {again}.")
-    if hashlib.sha256(packed).hexdigest() != declared.get("arrays_sha256"):
-        raise InputError(
-            f"{arrays}: the file is cut or altered (its checksum differs); copy it again."
-        )
-    try:
-        return declared, load_arrays(packed)
-    except SafetensorError as error:
-        raise InputError(f"{arrays}: cannot be read ({error}).") from None
-
-
-def _checksum(declaration: Any) -> str:
-    canonical = json.dumps(declaration, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()

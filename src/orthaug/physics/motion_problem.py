@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -22,6 +22,7 @@ from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Record
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
+from orthaug.physics.parameters import PhysicalParameter
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
 # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
@@ -46,7 +47,11 @@ class MotionProblem:
     deviation: Vector
     weight: OutputWeights
 
-    first_row = 0
+    first_row: ClassVar[int] = 0
+    new_state: ClassVar[str] = "write the state out as a state of the motion with its own equation"
+    """Remedy for a state that the physics lacks, in words."""
+    linear: ClassVar[bool] = False
+    """A motion is not linear in its parameters."""
 
     def __repr__(self) -> str:
         motion = self.motion
@@ -58,6 +63,69 @@ class MotionProblem:
     @property
     def outputs(self) -> tuple[str, ...]:
         return tuple(channel.name for channel in self.record.outputs)
+
+    @property
+    def physics(self) -> Motion:
+        """The physics that the record is fitted with."""
+        return self.motion
+
+    @property
+    def physics_in_words(self) -> str:
+        """The physics in a few words."""
+        return f"motion of {', '.join(self.motion.names_of_states)}"
+
+    @property
+    def parameters(self) -> tuple[PhysicalParameter, ...]:
+        """The parameters of the physics, as declared."""
+        return self.motion.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.motion.names
+
+    @property
+    def derived_units(self) -> dict[str, str]:
+        """Units of parameters that follow from those of the channels: none."""
+        return {}
+
+    def values_at(self, theta: Vector) -> Vector:
+        """Return the values of the parameters at their coordinates."""
+        return self.motion.coordinates.physical(theta)
+
+    @property
+    def feature_count(self) -> int:
+        """Number of inputs of a learner."""
+        return len(self.features)
+
+    @property
+    def learner_outputs(self) -> int:
+        """Number of outputs of a learner."""
+        return max(sum(map(len, self.motion.learned)), 1)
+
+    @property
+    def layout(self) -> tuple[SignalName, ...]:
+        """Names of states, then inputs."""
+        return layout_of(self.motion)
+
+    used = layout
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.record)
+
+    rows_in_memory = count
+
+    def physics_alone(self) -> MotionProblem:
+        """Return the problem without a learner, whose inputs take no rows from a motion."""
+        return self
+
+    def without_learner(self) -> MotionProblem:
+        """Return the problem with no state and no output learned."""
+        states = tuple(replace(state, learned=False) for state in self.motion.states)
+        outputs = tuple(replace(output, learned=False) for output in self.motion.outputs)
+        return replace(self, motion=replace(self.motion, states=states, outputs=outputs))
 
     def on(self, record: Record) -> MotionProblem:
         """Return the motion's problem on another record."""

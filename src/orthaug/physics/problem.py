@@ -27,7 +27,7 @@ from orthaug.data.regressors import (
     lag_matrix,
     stack_rows,
 )
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, Parameter, derived_units
 from orthaug.physics.excitation import Excitation, excitation, require_rank
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
@@ -114,6 +114,63 @@ class Problem:
             f"Problem({len(self.rows)} rows of {', '.join(self.outputs)}, x: {lags}, "
             f"{self.baseline!r})"
         )
+
+    @property
+    def new_state(self) -> str:
+        """Remedy for a state that the physics lacks, in words."""
+        return (
+            "add lags of outputs and inputs to the physics, or write the system as a motion with "
+            "that state"
+        )
+
+    @property
+    def physics(self) -> Baseline:
+        """The physics that the record is fitted with."""
+        return self.baseline
+
+    @property
+    def physics_in_words(self) -> str:
+        """The physics in a few words."""
+        return repr(self.baseline)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters of the physics, as declared."""
+        return self.baseline.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.baseline.names
+
+    @property
+    def linear(self) -> bool:
+        """True if the physics is linear in θ."""
+        return self.baseline.linear
+
+    @property
+    def derived_units(self) -> dict[str, str]:
+        """Units of parameters that follow from those of the channels."""
+        return derived_units(self.baseline, self.record.outputs, self.record.inputs)
+
+    def values_at(self, theta: Vector) -> Vector:
+        """Return the values of the parameters at θ, which they are."""
+        return theta
+
+    @property
+    def rows_in_memory(self) -> int:
+        """Number of rows that are in memory."""
+        return len(self.rows)
+
+    @property
+    def feature_count(self) -> int:
+        """Number of inputs of a learner."""
+        return len(self.features.entries)
+
+    @property
+    def learner_outputs(self) -> int:
+        """Number of outputs of a learner."""
+        return len(self.outputs)
 
     @property
     def lengths(self) -> tuple[int, ...]:

@@ -89,12 +89,13 @@ def check_text(result: CheckResult) -> str:
     """Return excitation, identifiability, and possible biases of the parameters."""
     data, physics = result.excitation, result.identifiability
     condition = f"{data.condition:.4g}" if data.condition is not None else "infinite"
-    moves = result.motion is not None
-    driven = result.motion is None or len(result.regressor) > len(result.motion.states)
-    where = ("with rich inputs" if driven else "from other starts") if moves else "at random points"
+    motion, entries, where = result.motion, "regressor       ", "at random points"
+    if motion is not None:
+        driven = len(result.regressor) > len(motion.states)
+        entries, where = "states, inputs  ", "with rich inputs" if driven else "from other starts"
     lines = [
         f"parameters       {', '.join(result.parameters) or 'none'}",
-        f"{'states, inputs  ' if moves else 'regressor       '} {', '.join(result.regressor)}",
+        f"{entries} {', '.join(result.regressor)}",
         f"usable rows      {result.rows}",
         f"excitation       rank {data.rank} of {data.columns} on the data, condition {condition}",
         f"identifiability  rank {physics.rank} of {physics.columns} {where}: "
@@ -109,8 +110,8 @@ def check_text(result: CheckResult) -> str:
     if physics.identifiable:
         for group in data.collinear:
             lines.append(f"  not excited separately by these data: {', '.join(group)}")
-    if result.motion is not None and result.motion.text:
-        lines += ["", result.motion.text]
+    if motion and motion.text:
+        lines += ["", motion.text]
     if result.shared is not None:
         lines += ["", *_shared_lines(result.shared)]
     if result.bias:

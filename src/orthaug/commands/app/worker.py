@@ -21,11 +21,12 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.commands import init as starting
 from orthaug.commands.job import Job
-from orthaug.commands.kinds import kind_of, open_job
+from orthaug.commands.job_result import check as check_job
+from orthaug.commands.job_result import refusal
+from orthaug.commands.opening import open_job
 from orthaug.data.columns import Column
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Survey
-from orthaug.physics.baseline import derived_units
 
 MOST = 3000
 """Points of a curve that are drawn."""
@@ -172,15 +173,15 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
             time.
     """
     job = open_job(Path(path), require_full_rank=False)
-    moves = job.spec.motion is not None
+    runs = job.physics.runs_in_check
     answer: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
-    if whole or not moves:
-        if moves:
+    if whole or not runs:
+        if runs:
             from orthaug._base.jax import use_compilation_cache
 
             use_compilation_cache()
-        result = kind_of(job).check(job)
-        refused = kind_of(job).refusal(job, result)
+        result = check_job(job)
+        refused = refusal(job, result)
         bias = [
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()
@@ -219,17 +220,8 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
 
     The last is None where the regressor implies none.
     """
-    if job.spec.motion is not None:
-        return [
-            (name, entry.unit or "", None) for name, entry in job.spec.motion.parameters.items()
-        ]
-    if job.spec.baseline is None:
-        return []
-    record, baseline = job.train.record, job.problem.baseline
-    derived, given = derived_units(baseline, record.outputs, record.inputs), {}
-    for term in baseline.terms:
-        given[term.parameter] = term.unit or given.get(term.parameter, "")
-    return [(name, unit, derived.get(name)) for name, unit in given.items()]
+    derived = job.problem.derived_units
+    return [(name, unit, derived.get(name)) for name, unit in job.physics.declared_units.items()]
 
 
 def _prepared_curves(job: Job) -> dict[str, Any]:

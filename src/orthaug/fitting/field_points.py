@@ -1,4 +1,4 @@
-"""Measures over the states and inputs of a motion, on which physics is split from learner."""
+"""The points of a measure along the fitted motion, and how these move with its unknowns."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.motion_split import Field, rest_of
-from orthaug.inference.splitting import warn_beyond_data
+from orthaug.inference.splitting import beyond_data
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 
@@ -51,7 +51,7 @@ def field_under(
     finite = np.isfinite(found).all(axis=0)
     weight = np.where(finite, points.weight, 0.0)
     share = support.share(points)
-    warnings = warn_beyond_data(measure, share, form, "the parameters depend")
+    warnings = beyond_data(measure, share) if form.learns else ()
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 

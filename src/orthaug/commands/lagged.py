@@ -1,0 +1,433 @@
+"""Physics that is linear in θ on lagged signals, in a job: posed, trained, analysed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+
+from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.imitation import Imitation, imitation
+from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
+from orthaug.analysis.suspects import Suspect
+from orthaug.commands.attempt import attempt, attempt_warned
+from orthaug.commands.job import Job, JobPhysics, Variant
+from orthaug.commands.parts import Part
+from orthaug.commands.spec import Spec
+from orthaug.commands.suspects import check_suspects, declare_suspects
+from orthaug.data.expressions import SAMPLING_TIME
+from orthaug.data.record import Record
+from orthaug.data.regressors import Lags, largest_lag
+from orthaug.data.sources import RecordSource
+from orthaug.fitting.elimination import directions
+from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.kinds import STRUCTURES
+from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
+from orthaug.inference.nearly_shared import shared_warnings
+from orthaug.physics import ill_conditioned
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.excitation import identifiability, require_rank
+from orthaug.physics.parameters import PhysicsMap, with_initial
+from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
+from orthaug.physics.streamed import pose_streamed
+from orthaug.reports.result import CheckResult, physical_rows
+
+if TYPE_CHECKING:
+    from orthaug.analysis.budget import Budget
+    from orthaug.analysis.design import Design
+    from orthaug.fitting.estimates import Estimate
+    from orthaug.models.response import Response
+    from orthaug.models.rows import Engine
+    from orthaug.reports.drawing import Figure
+    from orthaug.reports.findings import SuspectResult
+
+_ROWS = 20_000  # of the residual that are looked at
+_SPANNED = 1e-9  # of a term's squares: what is left of it beside the physics where it is physics
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: there are too few rows, or it is rounding error only.",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
+    """A baseline, what its learner sees, and the physical parameters behind θ."""
+
+    baseline: Baseline
+    map: PhysicsMap | None = None
+    lags: Lags | None = None
+    learner_inputs: tuple[str, ...] | None = None
+    weighed: WeighedPhysics | None = None
+    """The physics over the points of the job's measure."""
+
+    section: ClassVar[str] = "baseline"
+    runs_in_check: ClassVar[bool] = False
+    most_trials: ClassVar[int] = 3
+
+    @classmethod
+    def declare(cls, spec: Spec, step: float | None) -> Self:
+        baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        physics = None if step is None else spec.physics_map(step)
+        if physics is not None:
+            baseline = with_initial(physics, baseline)
+        baseline.check_initial()
+        spec.declared_structure().penalty(baseline.names, baseline.initial, 1.0)
+        baseline.check_channels(spec.data.outputs, spec.data.inputs)
+        lags = spec.lag_orders() if spec.declared_learner() is not None else None
+        return cls(baseline, physics, lags, learner_inputs)
+
+    @property
+    def structures(self) -> tuple[str, ...]:
+        """Kinds of structure that can be trained."""
+        return tuple(STRUCTURES)
+
+    @property
+    def declared_units(self) -> dict[str, str]:
+        """Units of the parameters and fixed terms, as declared, by their names."""
+        units: dict[str, str] = {}
+        for term in self.baseline.terms:
+            units[term.parameter] = term.unit or units.get(term.parameter, "")
+        return units
+
+    def names_taken(self, spec: Spec) -> set[str]:
+        physical = spec.physics.parameters if spec.physics is not None else {}
+        terms = {term.parameter for term in self.baseline.terms}
+        return terms | {name for name, _ in self.baseline.constants} | set(physical)
+
+    def with_term(
+        self, job: Job, name: str, expression: str, place: str | None, initial: float
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change of a spec that adds a term of an output, and where that is, in words.
+
+        None where the spec has the term already.
+        """
+        spec, terms = job.spec, job.declaration["baseline"]["terms"]
+        several = len(spec.data.outputs) > 1 and place is not None
+        if any(_is_same(term, expression, place) for term in terms):
+            return None
+        output = {"output": place} if several else {}
+        change: dict[str, Any] = {
+            "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **output}]
+        }
+        if spec.physics is not None:
+            change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
+            change[f"physics.theta.{name}"] = name
+        return change, f"in the physics{f' of {place}' if several else ''}"
+
+    def explained_residual(
+        self, fit: Estimate
+    ) -> Callable[[SuspectResult], tuple[float, float]] | None:
+        """Return a function that gives the share of the one-step residual that a suspect explains.
+
+        With its coefficient. Both are beside the physics: the part of the suspect that the physics
+        spans is removed. Signals are scaled by the deviations of the outputs.
+
+        None with a learner, whose part the table of suspects explains.
+        """
+        if fit.learns or not len(fit.theta):
+            return None
+        problem, unit = fit.problem, fit.problem.deviation
+        rows = slice(None, None, 1 + len(problem.rows.x) // _ROWS)
+        x = problem.rows.x[rows]
+        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+        phi = phi / unit[:, None]
+        basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
+        runs = fit.model.predict(problem.record).trajectories
+        errors = [(run.measured - run.model)[problem.rows.start :] for run in runs]  # type: ignore[operator]
+        whole = (np.concatenate(errors)[rows] / unit).ravel()
+        error = whole - basis @ (basis.T @ whole)
+        constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
+
+        def explained(entry: SuspectResult) -> tuple[float, float]:
+            suspect = Suspect(entry.name, entry.expression, entry.output, constants=constants)
+            column = (suspect.values(x, problem.layout, problem.outputs) / unit).ravel()
+            rest = column - basis @ (basis.T @ column)
+            along, size = float(rest @ error), float(rest @ rest)
+            if not size > _SPANNED * float(column @ column):
+                return 0.0, 0.0
+            return along**2 / size / max(float(error @ error), np.finfo(float).tiny), along / size
+
+        return explained
+
+    def rows_needed(self, spec: Spec) -> tuple[int, int]:
+        channels = tuple(spec.data.outputs), tuple(spec.data.inputs)
+        layout, _ = regressor_of(self.baseline, self.lags, self.learner_inputs, *channels)
+        return largest_lag(layout), 0
+
+    def pose(self, spec: Spec, record: Record, **options: Any) -> Problem:
+        return self._posing(spec)(record, **options)
+
+    def _posing(self, spec: Spec) -> Callable[..., Problem]:
+        """Return a function that poses the problem on a record; it can be sent to a process."""
+        posed = (self.baseline, self.lags, self.learner_inputs)
+        return partial(_pose, posed=posed, output_weights=spec.training.output_weights)
+
+    def pose_part(
+        self, spec: Spec, train: Part, kind: str, engine: Engine, *, require_full_rank: bool
+    ) -> tuple[Problem, tuple[Warning, ...]]:
+        # On a cluster they are its tasks
+        several = spec.runs(linear=self.baseline.linear) > 1 and train.source is None
+        if kind in ("memory", "devices") or spec.brought or (kind == "dask" and several):
+            problem = self.pose(spec, train.record, require_full_rank=require_full_rank)
+        else:
+            first = self.rows_needed(spec)[0]
+            problem = pose_streamed(
+                train.source or RecordSource(train.record, first, spec.engine.partition_rows),
+                train.record,
+                engine.passes,
+                self.baseline,
+                self.lags,
+                self.learner_inputs,
+                output_weights=spec.training.output_weights,
+                require_full_rank=require_full_rank,
+            )
+        learner, left_out = spec.declared_learner(), ()
+        if learner is not None and problem.excitation.full_rank:
+            problem, _, left_out = independent_terms(problem, learner)
+        problem.feature_rows()
+        return problem, left_out
+
+    def under(self, measure: Measure, spec: Spec, problem: Problem) -> Self:
+        weighed = weigh_problem(measure, problem)
+        if problem.excitation.full_rank and not weighed.excitation.full_rank:
+            groups = "; ".join(", ".join(group) for group in weighed.excitation.collinear)
+            raise InputError(
+                f"under the {measure.name} measure the physics cannot distinguish {groups}; "
+                "widen or move it."
+            )
+        check_suspects(spec.suspects, problem, weighed)
+        return replace(self, weighed=weighed)
+
+    def check_record(self, problem: Problem, record: Record) -> None:
+        check_defined(problem, record)
+
+    def train(self, problem: Problem, **options: Any) -> Estimate:
+        return _train(problem, **options)
+
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], Problem], Callable[..., Estimate]]:
+        """Return functions that pose a variant on a fold, and train it.
+
+        They can be sent to another process. A fold is small: its rows are in memory.
+        """
+        physics = replace(self, lags=None, learner_inputs=None) if variant.physics_only else self
+        return physics._posing(job.spec), _train
+
+    def runner(self, engine: Engine) -> Any:
+        from orthaug.models.tasks import runs_on
+
+        return runs_on(engine)
+
+    def without(self, problem: Problem, samples: Any) -> str:
+        from orthaug.analysis.wild_effect import fit_without
+
+        return fit_without(problem, samples)
+
+    def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
+        """Return excitation, identifiability, and bias by suspects, and warnings on these."""
+        problem = job.problem
+        shared, warnings = self.shared(job)
+        found = {
+            "excitation": problem.excitation,
+            "identifiability": identifiability(
+                problem.baseline, problem.layout, problem.outputs, problem.rows.x
+            ),
+            "shared": shared,
+            "bias": self._bias(job) if problem.excitation.full_rank else None,
+        }
+        return found, [*ill_conditioned.of_physics(problem), *warnings]
+
+    def refusal(self, job: Job, result: CheckResult) -> InputError | None:
+        try:
+            require_rank(job.problem.excitation, job.problem.samples)
+        except InputError as error:
+            return error
+        return None
+
+    def robust(self, fit: Estimate, one_step: Response) -> Estimate:
+        """Return the fit with the standard errors that its residual calls for."""
+        from orthaug.analysis.robustness import robust_where_asked
+
+        return robust_where_asked(fit, one_step)
+
+    def analyse(
+        self,
+        job: Job,
+        fit: Estimate,
+        one_step: Response,
+        free_run: Response,
+        warnings: list[Any],
+    ) -> dict[str, Any]:
+        from orthaug.analysis.diagnosis import diagnose
+        from orthaug.analysis.free_run_stability import stability
+        from orthaug.analysis.missing_lags import missing_lags
+
+        problem = fit.problem
+        return {
+            **self._physical(job, fit, warnings),
+            "bias": attempt("the bias by suspects", partial(self._bias, job, fit), warnings, None),
+            "measure_detail": fit.measure,
+            "stability": attempt_warned(
+                "the analysis of the free run's sensitivity",
+                lambda: stability(fit.model, problem.record, response=free_run, x=problem.rows.x),
+                warnings,
+            ),
+            "residuals": attempt_warned(
+                "the analysis of the residual",
+                lambda: diagnose(fit, one_step=one_step, free_run=free_run),
+                warnings,
+                _NOT_ANALYSED,
+            ),
+            "missing_lags": attempt_warned(
+                "the search for missing lags", lambda: missing_lags(fit, one_step), warnings
+            ),
+            "budget": attempt_warned(
+                "the bias that the learner implies", partial(self._budget, job, fit), warnings
+            ),
+        }
+
+    def shared(
+        self, job: Job, fit: Estimate | None = None
+    ) -> tuple[Imitation | None, list[Warning]]:
+        """Return what the learner could imitate, and warnings on what it nearly could.
+
+        None without a learner, or where the structure splits nothing along chosen directions.
+
+        Args:
+            fit: of the job's problem; None for the problem as it was posed, with the effect of
+                other learner inputs.
+        """
+        structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
+        splits = structure.projects and structure.shared != "all"
+        if job.spec.declared_learner() is None or not splits:
+            return None, []
+        if not problem.baseline.names or not problem.features.entries:
+            return None, []
+        held = tuple(fit.at_bound) if fit else ()
+        found = imitation(problem, self.map, others=fit is None, held=held)
+        if fit is not None and not fit.status.ok:
+            return found, []
+        seen = [str(entry) for entry in problem.features.entries]
+        return found, shared_warnings(problem.shared, seen)
+
+    def figures(
+        self,
+        job: Job,
+        fit: Estimate,
+        responses: Mapping[str, tuple[Response, Response]],
+    ) -> dict[str, Figure]:
+        from orthaug.reports import plots
+
+        one_step, _ = responses[job.parts[-1].name]
+        where = f"{job.parts[-1].name}, {fit.model.structure}"
+        drawn = {"residual": plots.residual_figure(one_step, f"one-step residual, {where}")}
+        if fit.learns:
+            drawn["components"] = plots.components_figure(
+                one_step, f"parts of the one-step prediction, {where}"
+            )
+        return drawn
+
+    def run_alone(self, fit: Estimate, record: Record, free_run: Response) -> Response:
+        """Return the free run by the model's physics without its learner, trained beside it."""
+        return fit.model.physics_only.simulate(record)
+
+    def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
+        """Return the input that is asked for, by θ of the spec or least squares."""
+        from orthaug.analysis.design import design_input
+
+        problem = job.problem
+        theta = problem.projection.solve(problem.whitened_target)
+        residual = problem.weight.outputs(problem.whitened_target - problem.projection.phi @ theta)
+        given = problem.baseline.initial
+        return design_input(
+            problem.baseline,
+            outputs=problem.outputs,
+            inputs=[channel.name for channel in problem.record.inputs],
+            suspects=declare_suspects(job.spec.suspects, problem),
+            noise=tuple(residual.std(axis=0)) if noise is None else noise,
+            theta=given if np.all(given) else theta,
+            **asked,
+        )
+
+    def _physical(self, job: Job, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
+        """Return the physical parameters of θ̂ and their findings, where the spec has a map.
+
+        Warnings are added.
+        """
+        if self.map is None:
+            return {}
+        physical, profiles, slopes = fit.physical(self.map), None, None
+        warnings += physical.warnings
+        section = job.spec.physics
+        if section is not None and section.profile and physical.covariance is not None:
+            profiles = {name: fit.physical_profile(self.map, name) for name in physical.names}
+        if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
+            slopes = {
+                name: dict(zip(self.map.theta_names, row, strict=True))
+                for name, row in zip(physical.names, physical.sensitivities, strict=True)
+            }
+        return {
+            "physical_parameters": physical_rows(physical, profiles),
+            "physical_consistency": physical.consistency,
+            "sensitivities": slopes,
+        }
+
+    def _bias(self, job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
+        """Return the table of suspects under the spec's measure.
+
+        After a fit it uses θ and what the learner explains.
+
+        Before a fit it includes the usual suspects, since it shows which measure removes a bias.
+        """
+        if not job.problem.baseline.names:
+            return []
+        linearization = self._linearization(job, fit)
+        suspects = declare_suspects(job.spec.suspects, linearization.problem)
+        return bias_under(linearization, suspects, certify_usual=fit is None)
+
+    def _budget(self, job: Job, fit: Estimate) -> Budget | None:
+        """Return the bias that what the learner found implies, under the spec's measure."""
+        from orthaug.analysis.budget import budget_on
+
+        if fit.model.structure != "orthogonal":
+            return None
+        linearization = self._linearization(job, fit)
+        suspects = declare_suspects(job.spec.suspects, linearization.problem)
+        return budget_on(linearization, fit, suspects)
+
+    def _linearization(self, job: Job, fit: Estimate | None) -> MeasureLinearization:
+        problem, weighed, structure = job.problem, self.weighed, job.spec.declared_structure()
+        assert weighed is not None
+        if fit is None:
+            learns = job.spec.declared_learner() is not None
+            along = directions(structure, problem) if learns else None
+            return MeasureLinearization(
+                weighed, problem, problem.least_squares, self.map, None, along
+            )
+        if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors of the fit
+            problem = fit.problem
+            weighed = weigh_problem(job.measure, problem)
+        learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
+        return MeasureLinearization(
+            weighed, problem, fit.theta, self.map, learned, fit.model.shared
+        )
+
+
+def _is_same(term: Mapping[str, Any], expression: str, place: str | None) -> bool:
+    """Return whether a term of a spec is an expression of the same output."""
+    one, other = ("".join(str(text).split()) for text in (term["regressor"], expression))
+    return one == other and (place is None or term.get("output") in (None, place))
+
+
+def _pose(record: Record, posed: Any, **options: Any) -> Problem:
+    return pose(record, *posed, **options)
+
+
+def _train(problem: Problem, **options: Any) -> Estimate:
+    from orthaug.fitting.estimation import fit
+
+    return fit(problem, **options)

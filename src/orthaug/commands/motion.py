@@ -1,0 +1,438 @@
+"""Equations of motion, in a job: posed, trained, analysed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+
+from orthaug._base.errors import InputError, KeyedError, RankError, Warning
+from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.commands.attempt import attempt, attempt_warned
+from orthaug.commands.job import Job, JobPhysics, Variant
+from orthaug.commands.scales import describe_scales
+from orthaug.commands.spec import Spec, spec_error
+from orthaug.commands.suspects import declared_terms
+from orthaug.data.record import Record
+from orthaug.fitting.rules import check_motion_choices, check_solver, choose_regularizations
+from orthaug.inference.measures import Measure, Support
+from orthaug.physics.motion import HOLDS, Motion
+from orthaug.physics.motion_problem import MotionProblem, pose_motion
+from orthaug.reports.result import CheckResult, MeasureResult
+
+if TYPE_CHECKING:
+    from orthaug.analysis.design import Design
+    from orthaug.analysis.imitation import Imitation
+    from orthaug.analysis.input_timing import Trial
+    from orthaug.fitting.motion_estimates import MotionEstimate
+    from orthaug.models.response import Response
+    from orthaug.reports.drawing import Figure
+
+_STIFF = 20  # substeps from which a motion is called stiff for its sampling
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
+    "error only.",
+)
+_NOT_RICH = Warning(
+    "rich_inputs_run_away",
+    "physics alone diverges under rich inputs, so identifiability is computed for the inputs "
+    "of the record.",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
+    """Equations of motion, and the terms that they may lack."""
+
+    motion: Motion
+    suspects: tuple[MotionSuspect, ...] = ()
+
+    section: ClassVar[str] = "motion"
+    runs_in_check: ClassVar[bool] = True
+    most_trials: ClassVar[int] = 2
+
+    @classmethod
+    def declare(cls, spec: Spec, step: float | None) -> Self:
+        assert spec.motion is not None
+        try:
+            motion = spec.motion.motion_of(spec.data.inputs, spec.data.outputs)
+            motion.check_channels(spec.data.inputs, spec.data.outputs)
+        except InputError as error:
+            raise InputError(f"motion: {str(error).removeprefix('motion.')}") from None
+        try:
+            learner, structure = spec.declared_learner(), spec.declared_structure()
+            solver, criterion = spec.declared_solver(), spec.declared_criterion()
+            check_motion_choices(motion, learner, structure, criterion, solver)
+            given, validated = spec.training.regularization, spec.data.validation is not None
+            conditions = {"linear": False, "validated": validated, "learner": learner}
+            choices = choose_regularizations(given, solver, criterion, structure, **conditions)
+            check_solver(solver, criterion, choices)
+        except KeyedError as error:
+            raise spec_error(error) from None
+        return cls(motion)
+
+    @property
+    def declared_units(self) -> dict[str, str]:
+        """Units of the parameters, as declared, by their names."""
+        return {parameter.name: parameter.unit for parameter in self.motion.parameters}
+
+    def names_taken(self, spec: Spec) -> set[str]:
+        section = spec.motion
+        assert section is not None
+        return {*section.states, *section.parameters, *section.define, *section.constants}
+
+    def with_term(
+        self, job: Job, name: str, expression: str, place: str | None, initial: float
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change of a spec that adds a term of an equation, and where that is, in words.
+
+        None where the equation has the term already, or for a term of an output.
+        """
+        from orthaug.analysis.motion_suspects import equations_of, usual_places
+
+        motion = self.motion
+        if place is None:
+            places = usual_places(motion)
+            place = equations_of(motion)[places[0]] if len(places) == 1 else None
+        if place not in motion.names_of_states:
+            return None
+        key = "next" if motion.scheme.discrete else "derivative"
+        own = str(job.declaration["motion"]["states"][place][key])
+        if f"*{''.join(expression.split())}" in "".join(own.split()):
+            return None
+        change = {
+            f"motion.states.{place}.{key}": f"{own} + {name}*({expression})",
+            f"motion.parameters.{name}": {"initial": initial},
+        }
+        return change, f"in the equation of {place}"
+
+    def other_holds(self, spec: Spec) -> tuple[str, ...]:
+        if not self.motion.inputs or self.motion.scheme.discrete:
+            return ()
+        return tuple(hold for hold in HOLDS if hold != self.motion.hold)
+
+    def settled(self, fit: MotionEstimate) -> dict[str, Any]:
+        """Return the substeps of a fit, as a change of the spec: a search would cost most."""
+        form = fit.model.form
+        return {} if form.motion.scheme.discrete else {"motion.substeps": form.substeps}
+
+    def rows_needed(self, spec: Spec) -> tuple[int, int]:
+        """Return the rows before the first one with a prediction, and the fewest of a stretch.
+
+        So many determine the initial state of a run.
+        """
+        return 0, len(self.motion.states) + 1
+
+    def pose(self, spec: Spec, record: Record, **options: Any) -> MotionProblem:
+        inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
+        return pose_motion(record, self.motion, inputs, spec.training.output_weights, **options)
+
+    def under(self, measure: Measure, spec: Spec, problem: MotionProblem) -> Self:
+        """Return the physics with the suspects of the spec; the measure is tried.
+
+        It is tried on the guessed states, so that wrong names and limits are found before training.
+        """
+        rows = len(problem.record)  # a measure may weigh each of them
+        x, u = (np.resize(part.T, (rows, len(part))) for part in problem.guessed_points)
+        measure.points(Support.of_motion(problem.motion, x, u))
+        return replace(self, suspects=declared_terms(spec.suspects, problem))
+
+    def train(self, problem: MotionProblem, **options: Any) -> MotionEstimate:
+        from orthaug.fitting.motion_estimation import fit_motion
+
+        return fit_motion(problem, **options)
+
+    def fold_training(
+        self, job: Job, variant: Variant
+    ) -> tuple[Callable[[Record], MotionProblem], Callable[..., MotionEstimate]]:
+        """Return functions that pose a variant on a fold by the sizes of all rows, and train it."""
+        return job.problem.on, self.train
+
+    def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
+        from orthaug.analysis.absorbed import Waves
+        from orthaug.analysis.imitation import imitation_before
+        from orthaug.analysis.input_timing import dead_times, try_holds
+        from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
+        from orthaug.fitting.segmented_motion import SegmentedMotion
+        from orthaug.inference.motion_split import shared_of_motion
+        from orthaug.inference.nearly_shared import shared_warnings
+        from orthaug.models.learners import nothing_learned
+        from orthaug.models.moving import MotionDynamics
+
+        problem, spec = job.problem, job.spec
+        motion, criterion, structure = problem.motion, spec.declared_criterion(), job.structure
+        segmented = SegmentedMotion.of(problem.without_learner(), nothing_learned(), criterion)
+        identification = identify_ranks(segmented)
+        if identification is None:
+            wild = "".join(
+                f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
+            )
+            scales = describe_scales(problem.record)
+            cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
+            remedy = f"it meets a wild sample.{wild}" if wild else f"give others.{cause}"
+            raise InputError(
+                f"{job.path}: physics alone has no finite free run from its initial values; "
+                f"{remedy}"
+            )
+        learns, full_rank = spec.declared_learner() is not None, identification.on_data.full_rank
+        shared, on_rows = None, []
+        if learns and structure.shared != "all":
+            nothing, step = nothing_learned(), problem.record.sampling_time
+            form = MotionDynamics(motion, problem.features, nothing, step, problem.substeps)
+            run = (motion.coordinates.initial, identification.states, identification.inputs)
+            shared = imitation_before(form, *run)
+            seen = [str(entry) for entry in form.features]
+            on_rows = shared_warnings(shared_of_motion(form, *run), seen)
+        posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
+        trial = try_holds(posed, criterion, spec.declared_solver(), structure, waves)
+        text, warnings = _about_steps(problem, trial)
+        warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
+        if identification.by_any is None:
+            warnings.append(_NOT_RICH)
+        found = {
+            "excitation": identification.on_data,
+            "identifiability": identification.by_any or identification.on_data,
+            "shared": shared,
+            "bias": self._bias_of_physics(job, trial) if full_rank else None,
+            "motion": {
+                "states": motion.names_of_states,
+                "integrator": motion.integrator,
+                "fastest": problem.fastest,
+                "substeps": trial.substeps,
+                "rows": trial.rows,
+                "holds": trial.holds,
+                "best_hold": trial.best,
+                "text": text,
+            },
+        }
+        ill = ill_conditioned_alone(trial.task) if full_rank else ()
+        return found, [*ill, *on_rows, *warnings]
+
+    def refusal(self, job: Job, result: CheckResult) -> InputError | None:
+        found = result.excitation
+        if found.rank == found.columns:
+            return None
+        groups = "; ".join(
+            f"{group[0]} changes no output"
+            if len(group) == 1
+            else f"{', '.join(group)} cannot be distinguished"
+            for group in found.collinear
+        )
+        lacking = found.columns - found.rank
+        constants = (
+            "one of them as a constant" if lacking == 1 else f"{lacking} of them as constants"
+        )
+        remedy = f"give {constants}"
+        if result.identifiability.identifiable:
+            remedy += ", or use data that excite them separately"
+        return RankError(
+            f"the outputs do not determine the parameters (rank {found.rank} of {found.columns}): "
+            f"{groups}; {remedy}."
+        )
+
+    def robust(self, fit: MotionEstimate, one_step: Response) -> MotionEstimate:
+        """Return the fit with the standard errors that the residual of its free run calls for."""
+        from orthaug.analysis.robustness import robust_free_run
+
+        return robust_free_run(fit)
+
+    def describe(self, fit: MotionEstimate) -> dict[str, Any]:
+        motion, form = fit.problem.motion, fit.model.form
+        return {
+            "motion": {
+                "states": motion.names_of_states,
+                "integrator": motion.integrator,
+                "substeps": form.substeps,
+                "hold": motion.hold,
+                "window": fit.model.window,
+                "parts": (),
+                "substep_bias": None,
+            }
+        }
+
+    def analyse(
+        self,
+        job: Job,
+        fit: MotionEstimate,
+        one_step: Response,
+        free_run: Response,
+        warnings: list[Any],
+    ) -> dict[str, Any]:
+        from orthaug.analysis.learned_part import equation_parts
+        from orthaug.analysis.motion_diagnosis import diagnose_motion
+        from orthaug.analysis.motion_modes import motion_stability
+        from orthaug.analysis.motion_response import substep_bias
+
+        points = fit.reach(job.train.record)
+        x, u = np.split(points, [fit.model.form.states], axis=1)
+        found: dict[str, Any] = {
+            "residuals": attempt_warned(
+                "the analysis of the residual",
+                lambda: diagnose_motion(fit, free_run),
+                warnings,
+                _NOT_ANALYSED,
+            ),
+            "stability": attempt_warned(
+                "the analysis of the modes",
+                lambda: motion_stability(fit.model, x, u, record=job.train.record),
+                warnings,
+            ),
+        }
+        parts, learns = None, fit.learns
+        if learns:
+            parts = attempt(
+                "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
+            )
+            found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+        coarse = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
+        found["motion"] = self.describe(fit)["motion"] | {
+            "parts": parts or (),
+            "substep_bias": None if coarse is None else coarse.as_dict(),
+        }
+        table, budget = attempt(
+            "the bias by suspects", lambda: self._biases(fit), warnings, (None, None)
+        )
+        warnings += budget.warnings if budget else ()
+        return found | {"bias": table, "budget": budget}
+
+    def shared(self, job: Job, fit: MotionEstimate) -> tuple[Imitation | None, list[Warning]]:
+        from orthaug.analysis.imitation import MotionImitation
+        from orthaug.inference.nearly_shared import shared_warnings
+
+        if not fit.status.ok or not fit.learns:
+            return None, []
+        seen = [str(entry) for entry in fit.model.form.features]
+        return MotionImitation.of(seen, fit.shared), shared_warnings(fit.shared, seen)
+
+    def figures(
+        self,
+        job: Job,
+        fit: MotionEstimate,
+        responses: Mapping[str, tuple[Response, Response]],
+    ) -> dict[str, Figure]:
+        from orthaug.reports import plots
+        from orthaug.reports.learned_part import learned_of
+
+        part, model = job.parts[-1], fit.model
+        free = responses[part.name][1]
+        drawn = {
+            "residual": plots.residual_figure(free, f"free-run residual, {part.name}"),
+            "states": plots.states_figure(
+                model, part.record, f"states of the free run, {part.name}"
+            ),
+        }
+        if fit.learns:
+            drawn["simulation"] = plots.output_figure(free, f"free run, {part.name}", learns=True)
+            drawn["components"] = plots.parts_figure(
+                model, part.record, f"physics and learner, {part.name}"
+            )
+            learned = learned_of(fit, job.train.record)
+            assert learned is not None
+            title = f"learned beside the physics, by the {model.measure} measure"
+            drawn["learner"] = plots.learner_figure(learned, title)
+        return drawn
+
+    def run_alone(self, fit: MotionEstimate, record: Record, free_run: Response) -> Response:
+        """Return the free run by the model's physics without its learner, from the same start."""
+        return free_run.physics_alone
+
+    def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
+        """Return the input that is asked for, by the parameters of physics alone."""
+        from orthaug.analysis.motion_design import design_motion_input
+        from orthaug.fitting.motion_task import MotionTask
+
+        spec, motion = job.spec, job.problem.motion
+        task = MotionTask.of(job.problem.without_learner(), None, spec.declared_criterion())
+        solver: Any = spec.declared_solver()
+        task = task.prepare(solver, job.structure)
+        if task.physics is None:
+            raise InputError(
+                "physics alone has no finite free run from its initial values; give others."
+            )
+        left: Any = noise
+        point = task.physics.end.point
+        if noise is None:
+            squares = np.sum(point.errors**2, axis=(0, 1, 3))
+            left = tuple(np.sqrt(squares / task.plan.segments.count))
+        p = motion.coordinates.physical(point.theta)
+        own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
+        return design_motion_input(motion, suspects=self.suspects, **own, **asked)
+
+    def _bias_of_physics(self, job: Job, trial: Trial) -> list[dict[str, Any]] | None:
+        """Return the bias that each suspect would cause, with physics alone.
+
+        Without suspects in the spec, the usual ones with an effect.
+
+        None where physics alone has no run.
+        """
+        from orthaug.analysis.motion_bias import linearize_physics
+
+        linearization = linearize_physics(trial.task, job.structure)
+        if linearization is None:
+            return None
+        table = linearization.table(self.suspects or linearization.usual())
+        return [entry.as_dict() for entry in table if self.suspects or entry.size]
+
+    def _biases(self, fit: MotionEstimate) -> tuple[list[dict[str, Any]] | None, Any]:
+        """Return the table of suspects and of the causes in the budget, and the budget."""
+        from orthaug.analysis.motion_bias import suspected_bias
+        from orthaug.analysis.motion_budget import declared_budget
+
+        table = suspected_bias(fit, self.suspects) if self.suspects else []
+        budget = declared_budget(fit, self.suspects, table)
+        listed = {entry.suspect for entry in table}
+        usual = [
+            cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed
+        ]
+        return [entry.as_dict() for entry in (*table, *usual)] or None, budget
+
+
+def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warning]]:
+    """Return a text on the errors of integrator and hold in the outputs, and warnings."""
+    motion, warnings = problem.motion, []
+    step = problem.record.sampling_time
+    if motion.scheme.discrete:
+        return "The equations give the state one sample later: nothing is integrated.", warnings
+    if trial.substeps is None:
+        sentences = (
+            "physics alone has no finite free run from its initial values, so substeps and "
+            "holds were not tried."
+        )
+        return "", [Warning("physics_runs_away", sentences)]
+    sentences = [
+        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/s, sampled every "
+        f"{step:g} s; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
+        f"{motion.integrator} in a sample"
+        + (
+            " are as declared."
+            if motion.substeps is not None
+            else ": twice as many change the outputs by less than 1 % of the residual."
+        )
+    ]
+    if trial.substeps >= _STIFF:
+        text = (
+            f"the motion is stiff for its sampling: {trial.substeps} substeps; "
+            '`integrator = "exact"` may need fewer.'
+        )
+        warnings.append(Warning("stiff", text))
+    if len(trial.holds) > 1:
+        shown = ", ".join(
+            f"{held.hold} {'no run' if held.residual is None else f'{held.residual:.4g}'}"
+            for held in trial.holds
+        )
+        sentences.append(
+            "Residual of physics alone for each hold of the inputs, in deviations of the "
+            f"output: {shown}."
+        )
+        if trial.best is None:
+            sentences.append("No hold explains the data clearly better than the declared one.")
+        else:
+            text = (
+                f'the data are explained better by hold = "{trial.best}" than by the '
+                f'declared "{motion.hold}".'
+            )
+            warnings.append(Warning("other_hold", text))
+    return " ".join(sentences), warnings

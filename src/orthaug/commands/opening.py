@@ -1,0 +1,124 @@
+"""Open a job: read a spec and its data, pose the problem, check all of it before training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from orthaug._base.errors import InputError, KeyedError
+from orthaug.commands.data_sections import engine_of
+from orthaug.commands.job import Job, JobPhysics
+from orthaug.commands.lagged import LaggedPhysics
+from orthaug.commands.motion import MotionPhysics
+from orthaug.commands.parts import load_parts
+from orthaug.commands.spec import Spec, load_spec, spec_error
+from orthaug.data.record import check_channels
+from orthaug.fitting.rules import check_cost, check_scored
+from orthaug.inference.kinds import MeasurePlace
+from orthaug.physics.baseline import Baseline
+from orthaug.physics.motion import Motion
+
+PHYSICS: Mapping[type, Any] = {Baseline: LaggedPhysics, Motion: MotionPhysics}
+"""What a job asks its physics, by the kind of these."""
+
+
+def job_physics(physics: Baseline | Motion) -> Any:
+    """Return the part of a job that depends on its physics, without what a spec adds."""
+    return PHYSICS[type(physics)](physics)
+
+
+def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
+    """Read the spec and all its data, and pose the problem.
+
+    Args:
+        require_full_rank: refuse physics that is linear in θ and rank-deficient on the data.
+
+    Raises:
+        InputError: anything wrong with spec, files or physics; one line that names it.
+    """
+    return open_spec(path, load_spec(path), require_full_rank=require_full_rank)
+
+
+def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
+    """Return the job of a spec that is read already.
+
+    Raises:
+        InputError: as `open_job`.
+    """
+    parts, step = None, spec.data.step
+    if step is None and spec.physics is not None:  # whose map may contain the sampling time
+        parts = load_parts(path, spec)
+        step = parts[0].record.sampling_time
+    with _named(path):
+        check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
+        physics = _kind_of(spec).declare(spec, step)
+    train, validation, tests = parts or load_parts(path, spec)
+    with _named(path):
+        first, least = physics.rows_needed(spec)
+        train = train.without_short(first, least)
+        validation = validation and validation.without_short(first, least)
+        tests = tuple(part.without_short(first, least) for part in tests)
+        kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
+        engine = engine_of(spec.engine, kind)
+        problem, left_out = physics.pose_part(
+            spec, train, kind, engine, require_full_rank=require_full_rank
+        )
+        _check_sizes(spec, problem, engine)
+        entries = [str(entry) for entry in problem.used]
+        place = MeasurePlace(path.parent, entries, problem.record, problem.first_row)
+        measure = spec.declared_measure(place)
+        job = Job(
+            path=path,
+            spec=spec,
+            train=train,
+            validation=validation,
+            tests=tests,
+            physics=physics.under(measure, spec, problem),
+            problem=problem,
+            measure=measure,
+            engine=engine,
+            left_out=left_out,
+        )
+        for part in job.parts:
+            part.check_scorable(problem.first_row, train.record.sampling_time, least)
+            if part is not train:  # `pose` has looked at that
+                physics.check_record(problem, part.record)
+    return job
+
+
+def _kind_of(spec: Spec) -> type[JobPhysics]:
+    """Return the kind of physics that a spec declares a section of."""
+    return next(kind for kind in PHYSICS.values() if getattr(spec, kind.section) is not None)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Put the name of a spec before an error in it."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _check_sizes(spec: Spec, problem: Any, engine: Any) -> None:
+    """Raise InputError where no row would be scored, or training would not end.
+
+    JAX is not loaded for that.
+    """
+    longest = max(len(e) for e in problem.record.experiments) - problem.first_row
+    try:
+        check_scored(spec.declared_criterion(), longest)
+    except KeyedError as error:
+        raise spec_error(error) from None
+    sizes: dict[str, Any] = {
+        "rows": problem.count,
+        "features": problem.feature_count,
+        "outputs": problem.learner_outputs,
+        "held": problem.rows_in_memory,
+    }
+    runs, iterations = spec.runs(linear=problem.linear), spec.declared_solver().iterations
+    check_cost(
+        spec.declared_learner(), **sizes, iterations=iterations, runs=runs, room=engine.room()
+    )
