@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -18,10 +19,12 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
-from orthaug.analysis.budget import left_over, linearization_of, named_cause
+from orthaug.analysis.causes import explain_learner
+from orthaug.analysis.measure_bias import linearization_of
 from orthaug.analysis.suspects import Suspect
 
 SAMPLES, TS = 2000, 0.01
+LITTLE = 1e-12  # of the learner: the best cause is looked at, however little it explains
 VELOCITY = "y[k-1] - y[k-2]"
 BASELINE = oa.Baseline.from_terms(
     [oa.Term("theta1", "y[k-1]"), oa.Term("theta2", "y[k-2]"), oa.Term("theta3", "u[k-1]")]
@@ -181,14 +184,12 @@ def look(seed: int) -> Looked:
     for cause, coefficient in made.causes:
         values = coefficient * cause.values(problem.rows.x, problem.layout, problem.outputs)
         true = true + problem.projection.solve(problem.weight.rows(values))
-    ground, told = linearization_of(fit, oa.Training()), []
+    terms, told = linearization_of(fit, oa.Training()), []
     for declared in (tuple(cause for cause, _ in made.causes[:1]), ()):
-        best = named_cause(ground, declared, 0.0)
-        if best is None or not best.explained or not best.coefficient_found:
-            told.append(None)
-            continue
-        bias = best.coefficient_found * np.array(best.bias)
-        told.append((best.explained, bias, left_over(ground, best, declared)))
+        tried = (replace(each, enough=LITTLE) for each in terms.considered(declared))
+        causes = (explain_learner(terms, each, declared) for each in tried)
+        best = next((found for found in causes if found is not None), None)
+        told.append(None if best is None else (best.share, best.moved, best.unsure))
     shape = problem.projection.to_coordinates
     return Looked(
         true, np.asarray(fit.std), fit.theta - made.theta, fit.freedom, shape, tuple(told)

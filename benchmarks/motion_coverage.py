@@ -16,9 +16,10 @@ import numpy as np
 from machine import describe
 
 import orthaug as oa
+from orthaug.analysis.budget import budget_by
+from orthaug.analysis.causes import Considered, explain_learner
+from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.motion_bias import usual_biases
-from orthaug.analysis.motion_budget import motion_budget
 from orthaug.models.motion_field import parts_at
 
 M, C, K, COULOMB = 1.0, 2.0, 100.0, 1.5
@@ -121,7 +122,11 @@ def curve_inside(fit: oa.MotionEstimate) -> np.ndarray:
 
 def damper_alone(fit: oa.MotionEstimate) -> tuple[float, float, float]:
     """Whether the usual terms tell of dry friction, where none was declared, and the interval that counts it."""
-    budget = motion_budget(fit, *usual_biases(fit))
+    terms = linearize_fit(fit)
+    assert terms is not None
+    considered = Considered(*terms.usual_biases(), joint=True, seen_only=True)
+    causes = explain_learner(terms, considered)
+    budget = None if causes is None else budget_by(terms, [causes])
     found = None if budget is None else budget.of("c")
     if budget is None or found is None or found.ci95 is None:
         return 0.0, np.nan, np.nan

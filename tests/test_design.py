@@ -9,7 +9,7 @@ import pytest
 
 from orthaug import Baseline, InputError, Suspect, Term, design_input, synthetic
 from orthaug.analysis import signals
-from orthaug.analysis.design import Design
+from orthaug.analysis.input_search import Design
 from orthaug.reports.result import DesignResult
 
 SYSTEM = synthetic.MassSpringDamper()

@@ -688,13 +688,13 @@ def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees
 
 
 def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, monkeypatch):
-    from orthaug.analysis import motion_bias, motion_modes
+    from orthaug.analysis import free_run_bias, motion_modes
 
     def fails(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(motion_modes, "motion_stability", fails)
-    monkeypatch.setattr(motion_bias, "suspected_bias", fails)
+    monkeypatch.setattr(free_run_bias, "linearize_fit", fails)
     spec = put(folder).with_name("fails.toml")
     spec.write_text(SPEC.replace("[training]", SUSPECTS))
     code, out, err = orthaug("fit", spec, "--out", folder / "fails")

@@ -8,7 +8,7 @@ from test_motion_fit import TS, WHOLE, spring
 
 import orthaug as oa
 from orthaug import InputError
-from orthaug.analysis.design import Design
+from orthaug.analysis.input_search import Design
 
 TRUTH = np.array([1.0, 0.8, 25.0])
 NOISE, SAMPLES, AMPLITUDE = 0.02, 119, 8.0  # so short a record is flown in one piece

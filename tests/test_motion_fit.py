@@ -10,10 +10,10 @@ import pytest
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.missing_terms import doubted_equations, sensitivities
-from orthaug.analysis.motion_diagnosis import _colour, _traces
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
+from orthaug.analysis.verdict_text import describe_colour, small_effects
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.field_points import field_under
 from orthaug.fitting.motion_estimates import fitted_numbers
@@ -442,7 +442,7 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
     e = np.random.default_rng(2).normal(size=(4000, 2))
     e[1:, 0] += 0.2 * e[:-1, 0]
     tests = analyse([e], [np.zeros((4000, 0))], [np.zeros((4000, 0))], ["y", "z"], [], [])
-    told = _colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
+    told = describe_colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
     assert (
         told.startswith("y has autocorrelations of up to 0.2")
         and words in told
@@ -470,10 +470,10 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     )
     shares = tuple(Predictable(name, 1.0, 0.5, 0.0, 0.02) for name in "yz")
     names = (["y", "z"], ["u"], ["v"])
-    assert _traces(analyse([e], [u], [x], *names), shares) == ""
+    assert small_effects(analyse([e], [u], [x], *names), shares) == ""
     e[:, 0] += 0.1 * u[:, 0]
     e[:, 1] += 0.1 * (x[:, 0] ** 2 - 1)
-    told = _traces(analyse([e], [u], [x], *names), shares)
+    told = small_effects(analyse([e], [u], [x], *names), shares)
     assert (
         told
         == " Tests still detect small effects (y follows u; z varies with v): 2 % of its mean square at most."

@@ -11,9 +11,11 @@ from test_motion_fit import WHOLE, data, positive, spring
 
 import orthaug as oa
 from orthaug import InputError
-from orthaug.analysis.motion_bias import linearize_fit, softened_bias, usual_biases
-from orthaug.analysis.motion_budget import declared_budget, motion_budget, one_of_each, rivals_of
-from orthaug.analysis.motion_suspects import usual_motion_suspects
+from orthaug.analysis.bias import bias_table, table_beside
+from orthaug.analysis.budget import budget_by, budget_on
+from orthaug.analysis.catalogue import Catalogue
+from orthaug.analysis.causes import Considered, explain_learner, one_of_each, rivals_of
+from orthaug.analysis.free_run_bias import linearize_fit
 
 FRICTION = oa.MotionSuspect.of(
     "expression", "tanh(v/0.1)", factor="-1/m", unit="N", name="friction"
@@ -23,6 +25,29 @@ HARDENING = oa.MotionSuspect.of(
 )
 SUSPECTS = (FRICTION, HARDENING)
 TRUTH = np.array([1.0, 0.8, 25.0])
+
+
+def motion_budget(fit, table, smooth=()):
+    """The budget by given terms alone."""
+    terms, declared = linearize_fit(fit), [entry.suspect for entry in table]
+    if terms.learned is None:
+        return budget_on(terms, declared, table)
+    considered = Considered(table, smooth, joint=True, seen_only=True)
+    causes = explain_learner(terms, considered, declared)
+    return None if causes is None else budget_by(terms, [causes], declared=declared)
+
+
+def declared_budget(fit, declared, table=None):
+    """The budget by declared terms, and by usual ones where these are not sure."""
+    return budget_on(linearize_fit(fit), declared, table)
+
+
+def softened_bias(fit, suspects):
+    return linearize_fit(fit).softened(suspects)
+
+
+def usual_biases(fit):
+    return linearize_fit(fit).usual_biases()
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +88,9 @@ def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_siz
 def usual_of(fit: oa.MotionEstimate) -> list[str]:
     """Names of the usual terms over the guessed states."""
     x, u = fit.problem.guessed_points
-    return [suspect.name for suspect in usual_motion_suspects(fit.problem.motion, x.T, u.T)]
+    motion = fit.problem.motion
+    usual = Catalogue.of_motion(motion, motion.initial, x.T, u.T).usual()
+    return [suspect.name for suspect in usual]
 
 
 def refitted(fit: oa.MotionEstimate, friction: float, size: float) -> np.ndarray:
@@ -96,7 +123,7 @@ def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(
     learned: oa.MotionEstimate,
 ) -> None:
     friction, hardening = oa.suspected_bias(learned, SUSPECTS)
-    assert friction.seen and friction.moved[[0, 2]] == pytest.approx([0, 0], abs=1e-12)
+    assert friction.seen and friction.per_unit[[0, 2]] == pytest.approx([0, 0], abs=1e-12)
     assert friction.coefficient_found == pytest.approx(0.6, rel=0.03) and friction.explained > 0.98
     assert learned.values[1] - 0.6 * friction.per_unit[1] == pytest.approx(TRUTH[1], rel=0.02)
     assert (
@@ -339,11 +366,10 @@ def test_what_a_cause_leaves_of_the_learner_may_be_another_s(learned: oa.MotionE
         for suspect in (dry, drag)
     ]
     both = replace(ground, learned=(rows[0] + 0.5 * rows[1])[:, None])
-    first, second = both.table([dry, drag])
-    (after,) = both.after([replace(first, coefficient_found=1.0)], [first, second])
+    first, second = bias_table(both, [dry, drag])
+    (after,) = table_beside(both, [replace(first, coefficient_found=1.0)], [first, second])
     assert after.suspect is drag and after.explained == pytest.approx(1.0)
     assert after.coefficient_found == pytest.approx(0.5)
-    assert both.after([replace(first, seen=False)], [second]) == []
 
 
 def test_a_jump_that_is_there_stays_one(learned: oa.MotionEstimate) -> None:
@@ -422,20 +448,25 @@ def test_a_force_between_two_masses_is_named_in_both_equations(
     )
 
 
+def unweighted(terms, suspect) -> np.ndarray:
+    """A term in the learned equations over the points of the measure."""
+    return terms.values(suspect) / terms.weigh(np.ones((1, len(terms.field.size))))
+
+
 @pytest.mark.proof
 @pytest.mark.parametrize("points", [50, 20_000])
 def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(
     masses, points, monkeypatch
 ) -> None:
     """What two terms make together is found though another one explains more alone; their order tells nothing."""
-    monkeypatch.setattr("orthaug.analysis.motion_budget.CERTIFIED_POINTS", points)
+    monkeypatch.setattr("orthaug.analysis.causes.MOST_POINTS", points)
     ground, table = linearize_fit(masses), usual_biases(masses)[0]
     names = [entry.suspect.name for entry in table]
     one, two = (
         table[names.index(f"{kind} of x1-x2 in {v}")]
         for kind, v in (("dead_zone", "v1"), ("cubic", "v2"))
     )
-    values = 3.0 * ground._rows(one.suspect, 1) - 40.0 * ground._rows(two.suspect, 3)
+    values = 3.0 * unweighted(ground, one.suspect) - 40.0 * unweighted(ground, two.suspect)
     for entries in (table, table[::-1]):
         each = {
             found[0].equation: found[0]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from orthaug import Baseline, InputError, Record, Suspect, Term, estimate, synthetic
+from orthaug.analysis.catalogue import Catalogue
 from orthaug.analysis.suspects import (
     KINDS,
     WITH_MEMORY,
     data_width,
     suspect_columns,
-    usual_suspects,
 )
 
 LAYOUT = Suspect("all", "y[k-1] + y[k-2] + u[k-1]").lags
@@ -224,7 +224,7 @@ def test_a_difference_that_keeps_its_sign_has_no_friction(rising, named):
     problem = estimate(record, physics, learner=None).problem
     kinds = {
         suspect.name.split(" of ")[0]
-        for suspect in usual_suspects(problem)
+        for suspect in Catalogue.of_problem(problem).usual()
         if "y[k-1] - y[k-2]" in suspect.name
     }
     assert kinds == {"quadratic_drag", "cubic"} | ({"coulomb", "stribeck"} if named else set())
@@ -238,7 +238,7 @@ def test_friction_of_an_output_that_is_read_at_one_lag_and_changes_its_sign(shif
     terms = [Term(f"a{lag}", f"y[k-{lag}]") for lag in range(1, lags + 1)]
     physics = Baseline.from_terms([*terms, Term("g", "u[k]")])
     problem = estimate(record, physics, learner=None).problem
-    names = [suspect.name for suspect in usual_suspects(problem)]
+    names = [suspect.name for suspect in Catalogue.of_problem(problem).usual()]
     assert ("coulomb of y[k-1]" in names) == named and ("saturation of y[k-1]" in names) == (
         lags == 1
     )

@@ -1,12 +1,12 @@
 from . import signals as signals
-from .budgets import bias_budget as bias_budget
+from .budget import bias_budget as bias_budget
 from .design import design_input as design_input
 from .diagnosis import diagnose as diagnose
+from .free_run_bias import suspected_bias as suspected_bias
 from .free_run_stability import stability as stability
 from .linear_view import Linearization as Linearization
 from .linearization import linearize as linearize
-from .motion_bias import suspected_bias as suspected_bias
-from .motion_suspects import MotionSuspect as MotionSuspect
 from .observer import Observer as Observer
+from .suspects import MotionSuspect as MotionSuspect
 from .suspects import Suspect as Suspect
 from .validation import verdict as verdict

@@ -1,26 +1,25 @@
 """Bias budget: the cause that explains the learner, and the bias of every parameter by it.
 
 With F the learner's values under the measure and Δ a cause's, the coefficient is that of P⊥F on P⊥Δ
-and the bias, estimate less truth, `Φ_μ⁺Δ` times it. One cause is named: the declared suspect that
-explains most of ‖P⊥F‖² if that is enough, else the usual suspect or product of lags that does, or
-the member of a family (`catalogue`) that explains clearly more; one of each output where none is
-sure to be all of it. The interval is the hull over all causes that noise cannot separate
-from it (`bias_hull`).
+and the bias, estimate less truth, `Φ_μ⁺Δ` times it (`bias`, `causes`). The interval is the hull
+over all causes that noise cannot separate from it (`bias_hull`). A free run without a learner has
+no F: there only declared terms are tried, and their size follows from its residual by one
+Gauss-Newton step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, cast
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
-from orthaug.analysis.bias import SuspectedBias, orthogonal_part
+from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
 from orthaug.analysis.bias_hull import (
     MOST_PHYSICS,
     Candidate,
@@ -30,120 +29,25 @@ from orthaug.analysis.bias_hull import (
     is_determined,
     undetermined_warning,
 )
-from orthaug.analysis.catalogue import catalogue
-from orthaug.analysis.imitation import other_inputs
-from orthaug.analysis.measure_bias import MeasureLinearization, physical_with_bias
-from orthaug.analysis.suspects import Suspect, saturations, usual_suspects, usual_terms
-from orthaug.data.expressions import parse
-from orthaug.data.regressors import Features
+from orthaug.analysis.causes import (
+    SURE_SHARE,
+    Causes,
+    Considered,
+    explain_learner,
+    explain_residual,
+)
+from orthaug.analysis.free_run_bias import linearize_fit
+from orthaug.analysis.mapped_bias import physical_with_bias
+from orthaug.analysis.measure_bias import linearization_of
+from orthaug.analysis.suspects import MotionSuspect, Suspect, check_motion_suspects
 from orthaug.fitting.estimates import Estimate
-from orthaug.inference.measures import Measure, Symmetrized, Training, Uniform, weigh_problem
-from orthaug.physics.output_weights import times
+from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.inference.measures import Measure, Training
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.shared import seen_columns, shared_directions
 
-if TYPE_CHECKING:
-    from orthaug.analysis.motion_bias import TermBias
-
-_REMOVED = 0.1  # of the bias may remain
-_MEASURED_ROWS = 50_000  # above which no other measure is tried
-
-
-def remedies(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> list[str]:
-    """Return sentences on how to remove the bias of the named parameters, the easiest first."""
-    return [*_by_inputs(linearization, cause, biased), *_by_measure(linearization, cause, biased)]
-
-
-def _by_inputs(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> Iterator[str]:
-    """Yield the choice of learner inputs that frees most of the parameters."""
-    problem, suspect = linearization.problem, cause.suspect
-    if suspect.memory is not None:  # a function of the past is one of no inputs of one row
-        return
-    layout, x = problem.layout, problem.rows.x
-    now = {str(entry) for entry in problem.features.entries}
-    best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
-    for inputs in dict.fromkeys(
-        (*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))
-    ):
-        if set(inputs) == now:
-            continue
-        features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
-        if not set(features.lags) <= set(layout):
-            continue
-        if not seen_columns(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[
-            0
-        ]:
-            continue
-        shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
-        if shared.all:
-            continue
-        left = _bias(replace(linearization, directions=shared.basis), suspect)
-        freed = _freed_parameters(linearization, cause, left, biased)
-        if len(freed) > len(best[1]):
-            best = (inputs, freed)
-    if best[1]:
-        listed = ", ".join(f'"{text}"' for text in best[0])
-        rest = "" if len(best[1]) == len(biased) else f" for {', '.join(best[1])}"
-        yield f"set learner.inputs = [{listed}]{rest}"
-
-
-def _by_measure(
-    linearization: MeasureLinearization, cause: SuspectedBias, biased: Sequence[str]
-) -> Iterator[str]:
-    """Yield a measure that brings the bias of all of them near zero."""
-    if cause.seen is False or len(linearization.problem.rows) > _MEASURED_ROWS:
-        return
-    for measure in (Symmetrized(), Uniform()):
-        if measure.name == linearization.weighed.measure.name:
-            continue
-        try:
-            other = replace(
-                linearization, weighed=weigh_problem(measure, linearization.problem), learned=None
-            )
-            left = _bias(other, cause.suspect)
-        except InputError:
-            continue
-        if len(_freed_parameters(linearization, cause, left, biased)) == len(biased):
-            yield f"split under the {measure.name} measure"
-            return
-
-
-def _bias(linearization: MeasureLinearization, suspect: Suspect) -> Vector:
-    """Return the bias per unit of a suspect that the learner sees."""
-    values = suspect.values(
-        linearization.weighed.points.x, linearization.problem.layout, linearization.problem.outputs
-    )
-    return linearization.weighed.projection.solve_along(
-        times(linearization.weighed.unit, values), linearization.directions
-    )
-
-
-def _freed_parameters(
-    linearization: MeasureLinearization, cause: SuspectedBias, left: Vector, biased: Sequence[str]
-) -> tuple[str, ...]:
-    """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
-    names, before = linearization.problem.baseline.names, np.array(cause.bias)
-    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
-        linearization.slopes[0] if linearization.slopes else {}
-    )
-    return tuple(
-        name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before)
-    )
-
-
-LEAST_SHARE = 0.5  # of the learner's energy that a cause must explain to be named
-_NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
-_FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
-AS_MUCH = 0.98  # of what the cause explains: a rival is as good
-SURE_SHARE = 0.9  # from which on a cause is named without a doubt
-_NEAR = 0.5  # of what the cause explains: a rival that is named beside it
-_MOST_RIVALS = 3
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _LISTED = 4  # parameters that a warning lists at most
+_FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
 
 
 @dataclass(frozen=True)
@@ -167,9 +71,17 @@ class ParameterBias:
 
 @dataclass(frozen=True, eq=False)
 class Budget:
-    """Bias of every parameter by the causes that explain the learner, the largest part first."""
+    """Bias of every parameter by the causes that explain the learner, the largest part first.
+
+    Without a learner they explain the free run's errors.
+    """
 
     causes: tuple[SuspectedBias, ...]
+    share: float
+    """Share of the learner that the first causes explain: one, or one of each learned equation.
+
+    Where each output has a cause, of what is learned of its own.
+    """
     parameters: tuple[ParameterBias, ...]
     physical: tuple[ParameterBias, ...]
     warnings: tuple[Warning, ...]
@@ -180,12 +92,9 @@ class Budget:
         return self.causes[0]
 
     @property
-    def share(self) -> float:
-        """Share of the learner that the causes explain.
-
-        Where each output has a cause, of what is learned of its own.
-        """
-        return explains(self.cause)
+    def coefficient(self) -> float:
+        """Its size, by the learner, else by what the free run leaves."""
+        return self.cause.coefficient
 
     def of(self, name: str) -> ParameterBias | None:
         """Return the bias of a parameter or physical parameter."""
@@ -194,21 +103,129 @@ class Budget:
         )
 
 
-def linearization_of(
-    fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
-) -> MeasureLinearization:
-    """Return the linearization of a fit for biases, under the measure that θ was split under."""
-    weighed = weigh_problem(measure, fit.problem)
-    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
-    return MeasureLinearization(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared)
+class BudgetTerms(TermPhysics, Protocol):
+    """A fit whose learner is to be explained: what a budget needs beside the table of biases."""
+
+    @property
+    def fit(self) -> Any:
+        """The estimate."""
+        ...
+
+    @property
+    def learned(self) -> Matrix | None:
+        """The learner at the measure's points; None without one."""
+        ...
+
+    @property
+    def bounds(self) -> Matrix:
+        """Bounds (nθ, 2) of the parameters."""
+        ...
+
+    @property
+    def map(self) -> PhysicsMap | None:
+        """The map from physical parameters to θ."""
+        ...
+
+    def considered(
+        self, declared: Sequence[Any], named: Sequence[SuspectedBias] | None = None
+    ) -> Iterator[Considered]:
+        """Yield terms in the order in which they are looked at, until some explain enough.
+
+        Args:
+            named: the biases by the declared suspects, where they are known.
+        """
+        ...
+
+    def parts(self) -> Sequence[tuple[str | None, BudgetTerms]]:
+        """Return the outputs of which something is learned, each with the fit of its part.
+
+        None for an output where the learner has no parts.
+        """
+        ...
+
+    def is_negligible(self, bias: Vector) -> bool:
+        """Return whether the learner found nothing that could bias so."""
+        ...
+
+    def noise_share(self) -> float:
+        """Return the share of noise in what the learner holds beside the physics."""
+        ...
+
+    def remedies(self, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
+        """Return what would remove the bias of the named parameters, the easiest first."""
+        ...
 
 
-def lagged_budget(
-    fit: Estimate,
-    suspects: Sequence[Suspect] = (),
+def bias_budget(
+    fit: Estimate | MotionEstimate,
+    suspects: Sequence[Suspect | MotionSuspect] = (),
     *,
     physics: PhysicsMap | None = None,
     measure: Measure | None = None,
+) -> Budget | None:
+    """Return the bias that what the learner found implies.
+
+    None where no cause explains enough of it.
+
+    Args:
+        fit: with a learner and the orthogonal structure; of others there is no budget. Of lagged
+            physics or a motion.
+        suspects: terms that may be missing, looked at first; of a motion `MotionSuspect`.
+        physics: the map from physical parameters to θ, for their biases; a motion has none.
+        measure: what θ was split under, where that is not the training measure; a motion's fit
+            knows its own.
+
+    Returns:
+        The `cause`, the `share` of the learner that it explains, and the bias of each of
+        `parameters` and `physical`, estimate less truth, with an interval that covers bias and
+        noise together: the hull over all causes that noise cannot separate. Where `determined` is
+        False that is wider than the value itself, and there is none.
+
+    Raises:
+        InputError: arguments that the kind of physics does not take; another measure than that of
+            the fit; a suspect on channels or lags that the data do not have.
+
+    Examples:
+        >>> import numpy as np
+        >>> import orthaug as oa
+        >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+        >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+        >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
+        >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+        >>> cubic, structure = oa.Terms(("u[k]**3",)), oa.Orthogonal(shared="all")
+        >>> fit = oa.estimate(record, gain, learner=cubic, structure=structure)
+        >>> budget = bias_budget(fit, [oa.Suspect("cubic", "u[k]**3")])
+        >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
+        ('cubic', 0.6)
+    """
+    check_type(fit, Estimate | MotionEstimate, "fit", "what estimate returns")
+    wanted = Suspect if isinstance(fit, Estimate) else MotionSuspect
+    for suspect in suspects:
+        check_type(
+            suspect,
+            wanted,
+            "suspects",
+            f"a sequence of {wanted.__name__}, as the fit's physics requires",
+        )
+    if isinstance(fit, Estimate):
+        return _lagged_budget(fit, cast(Any, suspects), physics=physics, measure=measure)
+    for name, given in (("physics", physics), ("measure", measure)):
+        if given is not None:
+            raise InputError(
+                f"`{name}` does not apply to a fit of equations of motion; leave it out."
+            )
+    declared = cast("Sequence[MotionSuspect]", suspects)
+    check_motion_suspects(declared, fit.problem)
+    terms = linearize_fit(fit)
+    return None if terms is None else budget_on(terms, declared)
+
+
+def _lagged_budget(
+    fit: Estimate,
+    suspects: Sequence[Suspect],
+    *,
+    physics: PhysicsMap | None,
+    measure: Measure | None,
 ) -> Budget | None:
     """Return `bias_budget` of a fit of difference equations."""
     if not fit.status.ok or fit.model.structure != "orthogonal":
@@ -219,139 +236,151 @@ def lagged_budget(
         raise InputError(
             f"`measure` is the {measure.name} measure, but θ was split under the {name} measure."
         )
-    return budget_on(linearization_of(fit, measure, physics), fit, suspects)
+    return budget_on(linearization_of(fit, measure, physics), suspects)
 
 
 def budget_on(
-    linearization: MeasureLinearization, fit: Estimate, suspects: Sequence[Suspect]
+    terms: BudgetTerms, declared: Sequence[Any], named: Sequence[SuspectedBias] | None = None
 ) -> Budget | None:
-    """Return the budget of a fit on a given linearization."""
-    if (
-        not linearization.problem.baseline.names
-        or linearization.learned is None
-        or not np.all(np.isfinite(linearization.learned))
-    ):
-        return None
-    if fit.freedom < _FEWEST_LEFT:
-        return None
-    noise = fit.model.statistics.noise
-    least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
-    something = np.mean(linearization.learned**2, axis=0) >= least
-    found, nameless = _causes(linearization, suspects, something) if something.any() else ([], [])
-    if not found:
-        return None
-    causes, moved = (
-        tuple(cause for _, cause in found),
-        np.array([_theta_shift(cause) for _, cause in found]),
-    )
-    bias, rest = (
-        moved.sum(axis=0),
-        [row for own, cause in found for row in left_over(own, cause, suspects)],
-    )
-    rest = np.array([*rest, *map(_theta_shift, nameless)])
-    candidates = _candidates(found, bias, np.linalg.norm(rest, axis=0), suspects, fit)
-    std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-    shifts = [_theta_shift(cause) for cause in nameless]
-    other = np.linalg.norm(np.array(shifts), axis=0) if shifts else 0.0
-    ends = hull(fit.theta, std, fit.freedom, candidates, other)
-    names = linearization.problem.baseline.names
-    parameters = parameter_biases(
-        names, fit.theta, std, bias, ends, _owners(causes, moved), fit.freedom
-    )
-    rows, warnings = (), []
-    if linearization.physics is not None:
-        rows, warnings = _physical_rows(linearization, fit, candidates, moved, causes, other)
-    raised = (
-        _warning(own, cause, (*rows, *parameters), suspects, own is not linearization)
-        for own, cause in found
-    )
-    raised = [warning for warning in raised if warning is not None]
-    open_ones = [row.name for row in (*rows, *parameters) if not row.determined]
-    if open_ones:
-        own, cause = found[0]
-        raised.append(undetermined_warning(open_ones, candidates, remedies(own, cause, open_ones)))
-    return Budget(causes, parameters, rows, (*raised, *warnings))
+    """Return the budget of a fit; None where nothing explains enough of its learner.
 
-
-def noise_share(linearization: MeasureLinearization, fit: Estimate) -> float:
-    """Return ν, the share of noise in what the learner holds beside the physics.
-
-    Noise takes σ² for each weight that the learner uses.
+    Args:
+        declared: suspects that were named, looked at first.
+        named: the biases by them, where they are known.
     """
-    noise = fit.model.statistics.noise
-    if noise is None:
-        return 0.0
-    unit = linearization.weighed.unit
-    own = orthogonal_part(
-        linearization.weighed.projection,
-        times(unit, np.asarray(linearization.learned)),
-        linearization.directions,
-    )
-    rows = np.ones((len(own), 1)) * np.sqrt(np.diag(noise))
-    taken = (
-        fit.effective_weights
-        / linearization.problem.count
-        * np.sum(times(unit, rows) ** 2)
-        / own.shape[1]
-    )
-    return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
+    if not terms.names or terms.fit.freedom < _FEWEST_LEFT:
+        return None
+    if terms.learned is None:
+        found = explain_residual(
+            named if named is not None else bias_table(terms, declared, certify=False)
+        )
+        return None if found is None else budget_by(terms, [found], declared=declared)
+    parts = terms.parts()
+    whole = first_causes(terms, declared, named) if parts else None
+    found = [] if whole is None else [whole]
+    nameless: list[SuspectedBias] = []
+    if whole is None or whole.share < SURE_SHARE:
+        each: list[Causes] = []
+        for output, own in parts:
+            if output is None:
+                continue
+            causes = first_causes(own, declared)
+            if causes is None:
+                rest = [e for c in own.considered(declared) for e in c.every if e.explained]
+                nameless += [max(rest, key=lambda entry: entry.share)] if rest else []
+            elif causes.entries[0].suspect.output == output:
+                each.append(replace(causes, output=output))
+        each.sort(key=_learned_size, reverse=True)
+        found = each if len(each) > len(found) else found
+    return budget_by(terms, found, nameless, declared) if found else None
+
+
+def first_causes(
+    terms: BudgetTerms, declared: Sequence[Any], named: Sequence[SuspectedBias] | None = None
+) -> Causes | None:
+    """Return the causes among the first terms, in the order of `considered`, that are enough."""
+    found = (explain_learner(terms, each, declared) for each in terms.considered(declared, named))
+    return next((causes for causes in found if causes is not None), None)
+
+
+def _learned_size(causes: Causes) -> float:
+    learner = None if causes.terms is None else causes.terms.linearization.learner
+    return 0.0 if learner is None else float(np.linalg.norm(learner))
+
+
+def budget_by(
+    terms: BudgetTerms,
+    found: Sequence[Causes],
+    nameless: Sequence[SuspectedBias] = (),
+    declared: Sequence[Any] = (),
+) -> Budget | None:
+    """Return the budget by given causes; None for a learner that found nothing.
+
+    Args:
+        found: one for all of the learner, or one for each output's part.
+        nameless: what explains most of each output that has no cause.
+    """
+    fit, value, bias = terms.fit, terms.value, np.sum([causes.moved for causes in found], axis=0)
+    if terms.is_negligible(bias):
+        return None
+    shifts = np.array([entry.shift for entry in nameless]).reshape(-1, len(bias))
+    other = np.linalg.norm(shifts, axis=0)
+    candidates = _candidates(terms, found, shifts, declared)
+    std = np.full(len(bias), np.nan) if fit.std is None else fit.std
+    ends = hull(value, std, fit.freedom, candidates, other)
+    ends = np.clip(ends, *terms.bounds.T[:, :, None])
+    owners = _owners(found, np.array([causes.moved for causes in found]))
+    parameters = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
+    physical, unbounded = _physical_rows(terms, found, candidates, other)
+    rows, warnings = (*physical, *parameters), []
+    for causes in found:
+        large = [row for row in rows if row.cause == causes.name and _is_large(row)]
+        if large:
+            cure = terms_of(causes, terms).remedies(causes.entries[0], [row.name for row in large])
+            warnings.append(_biased_warning(causes, large, cure, learns=terms.learned is not None))
+    open_ones = [row.name for row in rows if not row.determined]
+    if open_ones:
+        cure = terms_of(found[0], terms).remedies(found[0].entries[0], open_ones)
+        warnings.append(undetermined_warning(open_ones, candidates, cure))
+    entries = tuple(entry for causes in found for entry in causes.entries)
+    return Budget(entries, found[0].share, parameters, physical, (*warnings, *unbounded))
+
+
+def terms_of(causes: Causes, terms: BudgetTerms) -> BudgetTerms:
+    """Return the fit whose learner, or part of it, some causes explain."""
+    return terms if causes.terms is None else cast("BudgetTerms", causes.terms)
 
 
 def _candidates(
-    found: Sequence[tuple[MeasureLinearization, SuspectedBias]],
-    bias: Vector,
-    rest: Vector,
-    suspects: Sequence[Suspect],
-    fit: Estimate,
+    terms: BudgetTerms,
+    found: Sequence[Causes],
+    nameless: Float[np.ndarray, "k nt"],
+    declared: Sequence[Any],
 ) -> list[Candidate]:
     """Return the named causes and their rivals."""
-    several = " and ".join(cause.suspect.name for _, cause in found)
-    kept: list[Candidate] = [
-        NamedCause(several, min(explains(cause) for _, cause in found), bias, rest=rest)
-    ]
-    for own, cause in found:
-        others = (*_declared_causes(own, suspects), *_usual(own), *_families(own))
-        others += own.table(
-            saturations([entry.suspect for entry in others]), certify=False, every=False
-        )
+    bias = np.sum([causes.moved for causes in found], axis=0)
+    rest = np.concatenate([*(causes.unsure for causes in found), nameless])
+    name, share = " and ".join(c.name for c in found), min(c.share for c in found)
+    kept: list[Candidate] = [NamedCause(name, share, bias, rest=np.linalg.norm(rest, axis=0))]
+    for causes in found:
         likely = [
             Candidate(
                 entry.suspect.name,
-                explains(entry),
-                _theta_shift(entry) + bias - _theta_shift(cause),
-                entry.suspect in suspects,
+                entry.share,
+                entry.shift + bias - causes.moved,
+                entry.suspect in declared,
             )
-            for entry in others
+            for entry in causes.comparable
             if entry.explained
-            and (entry.suspect in suspects or (entry.cosine or 0.0) <= MOST_PHYSICS)
-        ]  # fmt: skip
-        kept += compatible(likely, noise_share(own, fit))
+            and (entry.suspect in declared or (entry.physics_cosine or 0.0) <= MOST_PHYSICS)
+        ]
+        if likely:
+            kept += compatible(likely, terms_of(causes, terms).noise_share())
     return kept
 
 
+def _owners(found: Sequence[Causes], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
+    """Return for each parameter the causes that move it most, and their share."""
+    return [(found[i].name, found[i].share) for i in np.argmax(np.abs(moved), axis=0)]
+
+
 def _physical_rows(
-    linearization: MeasureLinearization,
-    fit: Estimate,
+    terms: BudgetTerms,
+    found: Sequence[Causes],
     candidates: Sequence[Candidate],
-    moved: Float[np.ndarray, "k n"],
-    causes: Sequence[SuspectedBias],
-    other: Vector | float,
+    other: Vector,
 ) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
     """Return the biases of the physical parameters: the hull over the causes that matter.
 
     Those are the causes that move any of them farthest.
     """
-    assert linearization.physics is not None
-    physical, slopes, bias = (
-        fit.physical(linearization.physics),
-        linearization.slopes,
-        moved.sum(axis=0),
-    )
+    if terms.map is None:
+        return (), []
+    fit, slopes, count = terms.fit, terms.physical, len(terms.names)
+    physical = fit.physical(terms.map)
     own = np.array([np.nan if s is None else s for s in physical.std])
     turned = (
-        np.array([slopes[0][name] for name in physical.names])
-        if slopes
-        else np.zeros((0, len(bias)))
+        np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, count))
     )
     chosen = [candidates[0]]
     for row in turned:
@@ -362,197 +391,18 @@ def _physical_rows(
             chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
     ends, shifts = [], np.zeros(len(physical.names))
     for i, c in enumerate({id(c): c for c in chosen}.values()):
-        spread = np.outer(c.unsure, c.unsure) + np.diag(np.zeros(len(bias)) + other) ** 2
+        spread = np.outer(c.unsure, c.unsure) + np.diag(other) ** 2
         spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        moves, limits = physical_with_bias(
-            linearization, c.moved, fit.covariance, spread, fit.freedom
-        )
+        known = terms.map, fit.problem, terms.value, c.moved
+        moves, limits = physical_with_bias(*known, fit.covariance, spread, fit.freedom)
         shifts = shifts if i else moves
         ends.append(limits)
     # NaN where one has none
     ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)
-    owners = _owners(causes, moved @ turned.T) if slopes else []
+    moved = np.array([causes.moved for causes in found])
+    owners = _owners(found, moved @ turned.T) if slopes else []
     rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
     return rows, _unbounded_warnings(physical.names, own, ends)
-
-
-def _causes(
-    linearization: MeasureLinearization,
-    suspects: Sequence[Suspect],
-    something: Bool[np.ndarray, "ny"],
-) -> tuple[list[tuple[MeasureLinearization, SuspectedBias]], list[SuspectedBias]]:
-    """Return the causes that explain the learner, each with its linearization.
-
-    One cause explains all of it, or one cause each output's part.
-
-    Args:
-        something: whether anything is learned of an output.
-
-    Returns:
-        The causes; and of each output without one what explains most, where that is less than half.
-    """
-    whole, outputs = named_cause(linearization, suspects), linearization.problem.outputs
-    found = [] if whole is None else [(linearization, whole)]
-    if len(outputs) == 1 or (whole is not None and explains(whole) >= SURE_SHARE):
-        return found, []
-    each, nameless = [], []
-    for i in np.flatnonzero(something):
-        own = replace(
-            linearization, learned=np.asarray(linearization.learned) * np.eye(len(outputs))[i]
-        )
-        cause = named_cause(own, suspects) or _most_likely_suspect(own, suspects)
-        if cause is not None and explains(cause) < LEAST_SHARE:
-            nameless.append(cause)
-        elif cause is not None and cause.suspect.column_of(outputs) == i:
-            each.append((own, cause))
-    each.sort(
-        key=lambda part: (
-            -np.linalg.norm(times(linearization.weighed.unit, np.asarray(part[0].learned)))
-        )
-    )
-    return each if len(each) > len(found) else found, nameless
-
-
-def _owners(
-    causes: Sequence[SuspectedBias], moved: Float[np.ndarray, "k n"]
-) -> list[tuple[str, float]]:
-    """Return for each parameter the cause that moves it most, and its share."""
-    return [(causes[i].suspect.name, explains(causes[i])) for i in np.argmax(np.abs(moved), axis=0)]
-
-
-def named_cause(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect], least: float = LEAST_SHARE
-) -> SuspectedBias | None:
-    """Return the cause that explains most of the learner, the declared ones first.
-
-    None where that is less than `least`.
-
-    Undeclared terms count only if the learner sees them: others are no likely cause.
-    """
-    for table, families in (
-        (_declared_causes(linearization, suspects), ()),
-        (_usual(linearization), _families(linearization)),
-    ):
-        best, other = (
-            max(table, key=explains, default=None),
-            max(families, key=explains, default=None),
-        )
-        if other is not None and (best is None or explains(best) < AS_MUCH * explains(other)):
-            best = other
-        if best is not None and explains(best) >= least:
-            return best
-    return None
-
-
-def _most_likely_suspect(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect]
-) -> SuspectedBias | None:
-    """Return the suspect that explains most of the learner, however little, declared or not."""
-    found = (*_declared_causes(linearization, suspects), *_usual(linearization))
-    return max((entry for entry in found if entry.explained), key=explains, default=None)
-
-
-def explains(entry: SuspectedBias | TermBias) -> float:
-    """Return the share of the learner that an entry explains."""
-    return entry.explained or 0.0
-
-
-def _declared_causes(
-    linearization: MeasureLinearization, suspects: Sequence[Suspect]
-) -> tuple[SuspectedBias, ...]:
-    return linearization.table(tuple(suspects), certify=False, every=False) if suspects else ()
-
-
-def _usual(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    terms = (*usual_suspects(linearization.problem), *usual_terms(linearization.problem))
-    return tuple(
-        entry
-        for entry in linearization.table(terms, certify=False, every=False)
-        if entry.seen is not False
-    )
-
-
-def _families(linearization: MeasureLinearization) -> tuple[SuspectedBias, ...]:
-    """Return the biases by every member of the catalogue that the learner sees."""
-    table = linearization.table(catalogue(linearization.problem), certify=False, every=False)
-    return tuple(
-        entry
-        for entry in table
-        if entry.seen is not False and (entry.cosine or 0.0) <= MOST_PHYSICS
-    )
-
-
-def rival_of(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
-) -> SuspectedBias | None:
-    """Return a term that explains as much as a cause that no one declared, and moves θ elsewhere.
-
-    None where there is none.
-
-    An example is a dead zone and a saturation where the physics has a linear term: their sum is
-    that term.
-    """
-    assert cause.explained
-    if cause.suspect in suspects:
-        return None
-    usual = _usual(linearization)
-    usual += linearization.table(
-        saturations([entry.suspect for entry in usual]), certify=False, every=False
-    )
-    equal = [entry for entry in usual if explains(entry) >= AS_MUCH * cause.explained]
-    to_coordinates, own = linearization.weighed.projection.to_coordinates, _theta_shift(cause)
-
-    def separation(entry: SuspectedBias) -> float:
-        return float(np.linalg.norm(to_coordinates @ (_theta_shift(entry) - own)))
-
-    farthest = max(equal, key=separation, default=None)
-    return (
-        farthest
-        if farthest and separation(farthest) > 0.5 * np.linalg.norm(to_coordinates @ own)
-        else None
-    )
-
-
-def near_causes(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
-) -> list[SuspectedBias]:
-    """Return the next best causes, one per variable, for a cause undeclared and unsure."""
-    assert cause.explained
-    if cause.suspect in suspects or cause.explained >= SURE_SHARE:
-        return []
-    others = [
-        entry
-        for entry in _usual(linearization)
-        if entry.suspect != cause.suspect and entry.explained
-    ]
-    near = [entry for entry in others if explains(entry) >= _NEAR * cause.explained]
-    best: dict[str, SuspectedBias] = {}
-    for entry in sorted(near, key=explains, reverse=True):
-        best.setdefault(entry.suspect.on or entry.suspect.expression, entry)
-    return list(best.values())[:_MOST_RIVALS]
-
-
-def left_over(
-    linearization: MeasureLinearization, cause: SuspectedBias, suspects: Sequence[Suspect]
-) -> Float[np.ndarray, "k nt"]:
-    """Return the standard deviations of the bias of θ that the cause leaves open.
-
-    They are k directions, each of one unknown size.
-
-    The unexplained part of the learner is assumed to be as biased for its size as the cause, with
-    unknown sign; the next best cause adds its own bias. Rivals of the cause are in the hull.
-    """
-    assert cause.explained
-    after = _most_likely_suspect(
-        linearization.without(cause), [suspect for suspect in suspects if suspect != cause.suspect]
-    )
-    rows = [_theta_shift(cause) * np.sqrt((1 - cause.explained) / cause.explained)]
-    return np.array([*rows, *([] if after is None else [_theta_shift(after)])])
-
-
-def _theta_shift(cause: SuspectedBias) -> Vector:
-    """Return θ moved by a cause of the size found."""
-    return (cause.coefficient_found or 0.0) * np.array(cause.bias)
 
 
 def parameter_biases(
@@ -607,50 +457,45 @@ def _unbounded_warnings(names: Sequence[str], std: Vector, ends: Matrix) -> list
     return [Warning("physics_not_met", f"{text} correspond to no physical parameters.")]
 
 
-def _warning(
-    linearization: MeasureLinearization,
-    cause: SuspectedBias,
-    rows: Sequence[ParameterBias],
-    suspects: Sequence[Suspect],
-    of_one: bool,
-) -> Warning | None:
-    """Return the warning on biases above the standard error: cause, size and remedies.
+def _is_large(row: ParameterBias) -> bool:
+    """Return whether a bias is above the standard error, and no rounding."""
+    return (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING
 
-    The warning also says how sure the cause is.
-    """
-    own, name = [row for row in rows if row.cause == cause.suspect.name], cause.suspect.name
-    large = [row for row in own if (row.errors or 0.0) > 1 and abs(row.relative or 1.0) > _ROUNDING]
-    if not large:
-        return None
-    listed, share, there = (
-        list_biases(large),
-        explains(cause),
-        f" in {cause.suspect.output}" if of_one else "",
-    )
-    rival, cure = (
-        rival_of(linearization, cause, suspects),
-        " or ".join(remedies(linearization, cause, [row.name for row in large])),
-    )
-    other = (
-        ""
-        if rival is None
-        else f" ({rival.suspect.name} explains as much and would imply other values)"
-    )
-    if share < SURE_SHARE:
-        near = near_causes(linearization, cause, suspects)
-        close = ", ".join(f"{entry.suspect.name} {percent(explains(entry))}" for entry in near)
-        beside = f"; next: {close}" if near else ""
+
+def _biased_warning(
+    causes: Causes, large: Sequence[ParameterBias], remedies: Sequence[str], *, learns: bool
+) -> Warning:
+    """Return the warning on large biases: causes, sizes, remedies, and how sure the causes are."""
+    several, cure = len(causes.entries) > 1, " or ".join(remedies)
+    where = "" if causes.output is None else f" in {causes.output}"
+    listed, moves = " and ".join(map(_describe_cause, causes.entries)), list_biases(large)
+    first = sorted(causes.rivals, key=lambda entry: entry.share, reverse=True)[:2]
+    named = " and ".join(f"{rival.suspect.name}, {percent(rival.share)}" for rival in first)
+    other = f" (close to it: {named}, which would imply other values)" if first else ""
+    if learns and causes.share < SURE_SHARE:
+        near = ", ".join(f"{entry.suspect.name} {percent(entry.share)}" for entry in causes.near)
+        beside = f"; next: {near}" if near else ""
         return Warning(
             "biased",
-            f"what the learner found{there} looks most like {name} ({percent(share)} of "
-            f"it{beside}). This term would move {listed}; the standard errors do not cover "
-            f"this bias{other}{f'. If this term is the cause: {cure}' if cure else ''}.",
+            f"what the learner found{where} looks most like {listed} ({percent(causes.share)} of "
+            f"it{beside}). This would move {moves}; the standard errors do not cover this "
+            f"bias{other}{f'. If this is the cause: {cure}' if cure else ''}.",
         )
+    what = f"the learner{where}" if learns else "the free run's squared error"
     return Warning(
         "biased",
-        f"{name} explains {100 * share:.0f} % of the learner{there} and moves {listed}. The "
-        f"standard errors do not cover this bias{other}{f'. Remedy: {cure}' if cure else ''}.",
+        f"{listed} explain{'' if several else 's'} {100 * causes.share:.0f} % of {what} and "
+        f"move{'' if several else 's'} {moves}. The standard errors do not cover this "
+        f"bias{other}{f'. Remedy: {cure}' if cure else ''}.",
     )
+
+
+def _describe_cause(entry: SuspectedBias) -> str:
+    """Return the name of a cause; of a motion with its size, for its coefficient is physical."""
+    if entry.equation is None:
+        return entry.suspect.name
+    size = f"{entry.coefficient:.3g} {entry.suspect.unit}".rstrip()
+    return f"{entry.suspect.name} of size {size} in the equation of {entry.equation}"
 
 
 def list_biases(large: Sequence[ParameterBias]) -> str:

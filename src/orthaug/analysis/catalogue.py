@@ -1,24 +1,46 @@
-"""Families of terms that a physics may lack, with width or power profiled, for both kinds.
+"""Catalogue of the terms that a physics may lack, for difference equations and for motions.
 
-A family is one line of `FAMILIES`. Of every family each member is tried on everything that the
-learner sees.
+It has the usual suspects (friction, drag, hardening, bent inputs, an offset), products of two lags,
+and families: a line of `FAMILIES` is a form whose width or power is profiled, and each member is
+tried on everything that the learner sees. What a term can act on, and which outputs or equations
+may lack it, is all that differs between kinds of physics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.motion_suspects import MotionSuspect, usual_places
-from orthaug.analysis.suspects import Suspect, usual_suspects
+from orthaug.analysis.suspects import (
+    ODD_JUMPS,
+    WIDTHS,
+    MotionSuspect,
+    Suspect,
+    changes_sign,
+    evaluate_rows,
+    is_level,
+    median_size,
+)
+from orthaug.data.expressions import parse
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import Problem
+from orthaug.physics.suspected_motion import usual_places
 
+_VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
+_POSITION = ("cubic", "dead_zone")
+# Of an output read at one lag only, which may be a velocity
+_SINGLE = (*_POSITION, "saturation", "coulomb")
+_INPUT = ("cubic", "dead_zone", "saturation")
+_STATE = ("coulomb", "quadratic_drag", "cubic")
+_FEATURE = (*_STATE, "dead_zone")
+_MULTIPLIED = 6  # lags at most, of which products are tried
 _WIDTHS = (0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # in median sizes of what a term acts on
+_SOFT = _WIDTHS[1:]  # of friction that turns round smoothly
 _KINKS = (0.25, 0.5, 1.0, 1.5, 2.0)  # the same: beyond these hardly a row is on the other side
 _POWERS = (0.3, 0.4, 0.5, 0.65, 0.8, 1.2, 1.5, 2.0, 2.5, 3.0)
 _MOST_ARGUMENTS = 8  # expressions that the families are tried on
@@ -47,6 +69,153 @@ FAMILIES = (
 )
 
 
+class Argument(NamedTuple):
+    """An expression that terms may act on, its values in the data, and the usual kinds for it."""
+
+    text: str
+    values: Vector
+    kinds: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """Candidate terms of one physics.
+
+    Args:
+        places: outputs or equations that may lack a term.
+        arguments: what the usual suspects act on.
+        seen: what the families act on, everything that the learner sees.
+        products: expressions that are tried as they are.
+        of_kind: makes a suspect of a known kind from kind, argument, width, place and name.
+        of_text: makes one from an expression, what it acts on, place and name.
+    """
+
+    places: tuple[str, ...]
+    arguments: tuple[Argument, ...]
+    seen: tuple[Argument, ...]
+    products: tuple[str, ...]
+    of_kind: Callable[[str, str | None, float | None, str, str], Any]
+    of_text: Callable[[str, str | None, str, str], Any]
+
+    @classmethod
+    def of_problem(cls, problem: Problem) -> Catalogue:
+        """Return the catalogue for physics on lagged signals."""
+        layout, outputs, x = problem.layout, problem.outputs, problem.rows.x
+        constants, arguments = dict(problem.baseline.constants), []
+
+        def evaluate(text: str) -> Vector:
+            return evaluate_rows(parse(text), x, layout, f"'{text}'")
+
+        for channel in dict.fromkeys(lag.channel for lag in layout):
+            lags = sorted(lag for lag in layout if lag.channel == channel)
+            first, several = str(lags[0]), len(lags) > 1
+            values = evaluate(first)
+            if channel not in outputs:
+                arguments.append(Argument(first, values, _INPUT))
+                continue
+            root = ("square_root",) if is_level(values) else ()
+            arguments.append(Argument(first, values, (*(_POSITION if several else _SINGLE), *root)))
+            if several:
+                step = f"{first} - {lags[1]}"
+                arguments.append(Argument(step, evaluate(step), _VELOCITY))
+        texts = [*map(str, problem.features.entries), *(argument.text for argument in arguments)]
+        seen = []
+        for text in list({text.replace(" ", ""): text for text in texts}.values())[
+            :_MOST_ARGUMENTS
+        ]:
+            try:
+                seen.append(
+                    Argument(text, Suspect(text, text, constants=constants).form(x, layout))
+                )
+            except InputError:
+                continue
+        used = problem.used[:_MULTIPLIED]
+        pairs = [(one, other) for i, one in enumerate(used) for other in used[i:]]
+        products = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
+
+        def of_kind(kind: str, on: str | None, width: float | None, place: str, name: str) -> Any:
+            return Suspect.of(kind, on, width=width, output=place, name=name)
+
+        def of_text(text: str, on: str | None, place: str, name: str) -> Any:
+            own = constants if on is not None else {}
+            return Suspect(name, text, place, None, own, on)
+
+        return cls(outputs, (*arguments,), (*seen,), (*products,), of_kind, of_text)
+
+    @classmethod
+    def of_motion(
+        cls, motion: Motion, p: Vector, x: Matrix, u: Matrix, features: Sequence[str] = ()
+    ) -> Catalogue:
+        """Return the catalogue for a motion.
+
+        Args:
+            p: parameters (np,); states x (M, nx) and inputs u (M, nu) give the widths.
+            features: what the learner sees, such as the distance of two masses.
+        """
+
+        def evaluate(text: str) -> Vector:
+            return MotionSuspect(text, text).values(motion, p, x, u)
+
+        def of_kind(kind: str, on: str | None, width: float | None, place: str, name: str) -> Any:
+            return MotionSuspect.of(kind, on, width=width, equation=place, name=name)
+
+        def of_text(text: str, on: str | None, place: str, name: str) -> Any:
+            return MotionSuspect(name, text, place)
+
+        names, features = motion.names_of_states, list(dict.fromkeys(features))
+        more = [text for text in features if text not in (*names, *motion.inputs)]
+        arguments = [
+            *(Argument(name, row, _STATE) for name, row in zip(names, x.T, strict=True)),
+            *(Argument(name, row, _INPUT) for name, row in zip(motion.inputs, u.T, strict=True)),
+            *(Argument(text, evaluate(text), _FEATURE) for text in more),
+        ]
+        return cls(
+            tuple(motion.states[place].name for place in usual_places(motion)),
+            tuple(argument for argument in arguments if np.ptp(argument.values) > 0),
+            tuple(Argument(text, evaluate(text)) for text in features[:_MOST_ARGUMENTS]),
+            (),  # no products of states: a motion's families and usual terms have sufficed
+            of_kind,
+            of_text,
+        )
+
+    def usual(self) -> tuple[Any, ...]:
+        """Return the usual suspects, with widths from the data."""
+        found = []
+        for place in self.places:
+            label = self._label(place)
+            for argument in self.arguments:
+                for kind in argument.kinds:
+                    width = median_size(argument.values) if kind in WIDTHS else None
+                    if kind in ODD_JUMPS and not changes_sign(argument.values):
+                        continue  # what jumps there is as good as a constant
+                    if kind in WIDTHS and width is None:
+                        continue
+                    name = f"{kind} of {argument.text}{label}"
+                    found.append(self.of_kind(kind, argument.text, width, place, name))
+            found.append(self.of_kind("offset", None, None, place, f"offset{label}"))
+        return tuple(found)
+
+    def two_lags(self) -> tuple[Any, ...]:
+        """Return products of two lags of physics or learner, for effects beyond the usual ones."""
+        return tuple(
+            self.of_text(text, None, place, f"{text}{self._label(place)}")
+            for place in self.places
+            for text in self.products
+        )
+
+    def families(self) -> tuple[Any, ...]:
+        """Return every member of every family, on everything that the learner sees."""
+        return tuple(
+            self.of_text(text, argument.text, place, f"{name}{self._label(place)}")
+            for argument in self.seen
+            for name, text in family_members(argument.text, argument.values)
+            for place in self.places
+        )
+
+    def _label(self, place: str) -> str:
+        return f" in {place}" if len(self.places) > 1 else ""
+
+
 def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
     """Yield name and expression of every member of every family for an expression `on`."""
     size = np.abs(values[np.isfinite(values)])
@@ -59,49 +228,43 @@ def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
             yield f"{family.name}({on}, {w})", family.text(x, w)
 
 
-def catalogue(problem: Problem) -> tuple[Suspect, ...]:
-    """Return every member for the learner's declared inputs and the variables of usual suspects."""
-    constants = dict(problem.baseline.constants)
-    texts = [*map(str, problem.features.entries), *(s.on for s in usual_suspects(problem) if s.on)]
-    arguments = list({text.replace(" ", ""): text for text in texts}.values())[:_MOST_ARGUMENTS]
-    found = []
-    for on in arguments:
-        try:
-            values = Suspect(on, on, constants=constants).form(problem.rows.x, problem.layout)
-        except InputError:
-            continue
-        for name, text in family_members(on, values):
-            found += [
-                Suspect(
-                    name if len(problem.outputs) == 1 else f"{name} in {output}",
-                    text,
-                    output,
-                    None,
-                    constants,
-                    on,
-                )
-                for output in problem.outputs
-            ]
-    return tuple(found)
+def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
+    """Return a saturation for each dead zone, the rest of its channel.
+
+    Data of a physics with that channel cannot distinguish the two.
+    """
+    zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
+    return [
+        replace(
+            s,
+            name=s.name.replace("dead_zone", "saturation"),
+            expression=f"{s.on} - ({s.expression})",
+        )
+        for s in zones
+    ]
 
 
-def motion_catalogue(
-    motion: Motion, p: Vector, x: Matrix, u: Matrix, features: Sequence[str]
+def soften_jumps(
+    suspects: Sequence[MotionSuspect], motion: Motion, p: Vector, x: Matrix, u: Matrix
 ) -> tuple[MotionSuspect, ...]:
-    """Return every member for the learner's declared inputs, in each equation that may lack a term.
+    """Return smooth forms of friction: each suspect that jumps as tanh(v/width), of several widths.
 
     Args:
-        p: parameters (np,); states x (M, nx) and inputs u (M, nu) give the widths.
-        features: what the learner sees.
+        p: parameters (np,); with states x (M, nx) and inputs u (M, nu) they give the widths, in
+            median sizes.
     """
-    places, found = usual_places(motion), []
-    for on in list(dict.fromkeys(features))[:_MOST_ARGUMENTS]:
-        values = MotionSuspect(on, on).values(motion, p, x, u)
-        for place in places:
-            equation = motion.states[place].name
-            where = f" in {equation}" if len(places) > 1 else ""
-            found += [
-                MotionSuspect(f"{name}{where}", text, equation)
-                for name, text in family_members(on, values)
-            ]
+    found = []
+    for suspect in suspects:
+        if suspect.jump is None:
+            continue
+        size = np.abs(MotionSuspect(suspect.jump, suspect.jump).values(motion, p, x, u))
+        size = size[np.isfinite(size) & (size > 0)]
+        on = suspect.jump if suspect.jump.isidentifier() else f"({suspect.jump})"
+        for share in _SOFT if len(size) else ():
+            width = float(f"{share * np.median(size):.3g}")
+            soft = f"tanh({on}/{width!r})"
+            text = suspect.expression.replace(f"sign({suspect.jump})", soft)
+            found.append(
+                replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None)
+            )
     return tuple(found)

@@ -4,6 +4,11 @@ Noise in the equation leaves a white one-step residual. Noise on the measured ou
 coloured one. It makes one-step least squares inconsistent, and a free run then explains the data as
 well as a prediction from measured lags. With many rows every test rejects; so effects are measured,
 as shares of variance that could be predicted.
+
+The criterion of a motion is right for white noise on its outputs. Coloured errors of its free run
+that follow no input and no state are noise within the motion; errors that do are physics that is
+missing, or that the learner does not see. Simple terms, each tried in each equation, show what it
+is (`missing_terms`).
 """
 
 from __future__ import annotations
@@ -20,10 +25,18 @@ from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.inconsistency import inconsistency
-from orthaug.analysis.motion_diagnosis import diagnose_motion
-from orthaug.analysis.predictability import predictable
+from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
+from orthaug.analysis.missing_terms import missing_terms
+from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
-from orthaug.analysis.verdict_text import SHARE, Diagnosis, Finding, words
+from orthaug.analysis.verdict_text import (
+    SHARE,
+    Diagnosis,
+    Finding,
+    colour_sentence,
+    free_run_words,
+    words,
+)
 from orthaug.data.columns import quantum_of
 from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
@@ -31,6 +44,8 @@ from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Orthogonal
 from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem
@@ -48,6 +63,13 @@ _FEW, _LEAST = (0.005, 6)
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _MAD = 1.4826
 _NAMED = 3
+_LEVEL = 0.01  # of the test of missing terms
+# Of the output's deviation: a free run that leaves less has no dead time to look for
+_SIZABLE = 0.02
+_LAGS = 10  # of inputs that may predict the error
+_ROWS_PER_LAG = 20
+_MOST_ROWS = 20_000  # at which the error is set beside states
+_UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
 
 
 def diagnose(
@@ -84,7 +106,87 @@ def diagnose(
     if not fit.status.ok:
         raise InputError(f"`fit` has no model: {fit.status.message}.")
     own = fit.model.simulate(fit.problem.record) if free_run is None else free_run
-    return diagnose_motion(fit, own)
+    return _of_motion(fit, own)
+
+
+def _of_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
+    """Return the diagnosis by the free run's errors on the training data.
+
+    None where it ran away, or leaves rounding only.
+
+    Args:
+        free_run: of the training data.
+    """
+    record, motion = fit.problem.record, fit.problem.motion
+    if any(run.diverged for run in free_run.trajectories):
+        return None
+    if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
+        return None
+    errors, every = errors_of(free_run), -(-len(record) // _MOST_ROWS)
+    inputs = [e.inputs for e in record.experiments]
+    frame = fit.model.states(record)
+    ends = np.cumsum([len(e) for e in record.experiments])[:-1]
+    states = np.split(frame[list(motion.names_of_states)].to_numpy(), ends)
+    if not np.isfinite(np.concatenate(states)).all():
+        return None
+    names = ([c.name for c in record.outputs], list(motion.inputs), list(motion.names_of_states))
+    with one_blas_thread():
+        tests = analyse(errors, inputs, states, *names, lags=LAGS)
+        shares = tuple(_predictable(i, test, errors, inputs, every) for i, test in enumerate(tests))
+        missing = missing_terms(fit)
+    if any(test.white is None for test in tests):
+        return None
+    followed = {test.name: test.follows() for test in tests if test.follows()}
+    curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
+    lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
+    explained = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
+    white = all(test.practically_white() for test in tests)
+    size = rms_errors(free_run) / fit.problem.deviation
+    late = (
+        _dead_times(fit)
+        if motion.inputs and (explained or not white) and np.any(size > _SIZABLE)
+        else ()
+    )
+    verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
+    text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks, late)
+    warnings = [one.warning for one in late]
+    warnings += (
+        []
+        if white
+        else [
+            Warning("coloured_residual", colour_sentence(fit) + (_UNCOUNTED if explained else ""))
+        ]
+    )
+    return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
+
+
+def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
+    """Return the inputs that act later, by the physics trained before the learner.
+
+    It runs in the same compiled programs.
+    """
+    solver, posed = LevenbergMarquardt().within_limit, fit.problem
+    posed = posed if fit.learns else posed.without_learner()
+    learner = fit.model.form.bound.learner
+    return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
+
+
+def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
+    """Return the predictable shares of an output's error.
+
+    Its own past, lagged inputs and functions of states predict it.
+    """
+    signal = [piece[:, i] for piece in errors]
+    longest = min(_LAGS, min(map(len, signal)) // _ROWS_PER_LAG)
+    own = from_own_past(signal, max(longest, 1))
+    driven = [
+        [u[:, j] for u in inputs] for j in range(inputs[0].shape[1])
+    ]  # of each input its experiments
+    from_inputs = [from_lags(signal, [one], range(longest + 1)) for one in driven]
+    best = max((share.sure for share in from_inputs), default=0.0)
+    return Predictable(
+        test.name, float(test.rms or 0.0), own.sure, best, float(test.largest_share or 0.0)
+    )
 
 
 def _of_lagged(

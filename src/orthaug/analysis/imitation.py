@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.analysis.measure_bias import physical_slopes
+from orthaug.analysis.mapped_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
 from orthaug.inference.motion_split import shared_of_motion

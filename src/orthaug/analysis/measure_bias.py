@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,269 +10,310 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.absorbed import TermAfterFit, term_effects
-from orthaug.analysis.bias import SuspectedBias, bias_table
-from orthaug.analysis.suspects import Suspect, suspect_columns, usual_suspects
-from orthaug.inference.covariance import reach
-from orthaug.inference.measures import WeighedPhysics
-from orthaug.inference.physical import PhysicalEstimate, solve
+from orthaug._base.errors import InputError
+from orthaug.analysis.absorbed import term_effects
+from orthaug.analysis.bias import SuspectedBias, TermResponse, bias_table, seen_table
+from orthaug.analysis.bias_hull import MOST_PHYSICS
+from orthaug.analysis.catalogue import Catalogue, saturations
+from orthaug.analysis.causes import Considered
+from orthaug.analysis.imitation import other_inputs
+from orthaug.analysis.mapped_bias import physical_of, physical_slopes
+from orthaug.analysis.suspects import Suspect
+from orthaug.data.expressions import parse
+from orthaug.data.regressors import Features
+from orthaug.fitting.estimates import Estimate
+from orthaug.inference.linearization import Linearization
+from orthaug.inference.measures import (
+    Measure,
+    Symmetrized,
+    Uniform,
+    WeighedPhysics,
+    weigh_problem,
+)
+from orthaug.physics.excitation import excitation, require_rank
 from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
-from orthaug.physics.shared import seen_columns
+from orthaug.physics.shared import seen_columns, shared_directions
 
 # Of a measure at most, over which certificates are sought for suspects that no one named
 CERTIFIED_ROWS = 200_000
-_ROUNDING = 1e-9  # of a parameter: an end of its interval that lies so little on the wrong side
+_REMOVED = 0.1  # of a bias may remain
+_MEASURED_ROWS = 50_000  # above which no other measure is tried
+_NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 
 
 @dataclass(frozen=True, eq=False)
-class MeasureLinearization:
-    """Linearization that biases under a measure are computed on.
+class LaggedTerms:
+    """Terms that physics on lagged signals may lack, under a measure (`TermPhysics`).
 
     Args:
         weighed: the measure's points and the physics there, of one parameter or more.
-        physics: the map from physical parameters to θ.
         theta: θ̂ for relative biases and for dp/dθ.
+        map: from physical parameters to θ.
         learned: f at the measure's points (M, ny) after a fit, to find how much of it a suspect
             explains.
         directions: (nθ, s) along which θ is split; None for all.
+        fit: where these are of a fit.
     """
 
     weighed: WeighedPhysics
     problem: Problem
     theta: Vector
-    physics: PhysicsMap | None = None
+    map: PhysicsMap | None = None
     learned: Matrix | None = None
     directions: Matrix | None = None
+    fit: Estimate | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.problem.baseline.names
+
+    @property
+    def value(self) -> Vector:
+        return self.theta
+
+    @property
+    def slopes(self) -> Vector:
+        return np.ones(len(self.theta))
+
+    @property
+    def physical(self) -> tuple[dict[str, Vector], Vector] | None:
+        return self._physical
 
     @cached_property
-    def slopes(self) -> tuple[dict[str, Vector], Vector] | None:
-        """dp/dθ by name, and p."""
-        return physical_slopes(self.physics, self.problem, self.theta)
+    def _physical(self) -> tuple[dict[str, Vector], Vector] | None:
+        return physical_slopes(self.map, self.problem, self.theta)
 
-    def table(
-        self, suspects: Sequence[Suspect], *, certify: bool, every: bool = True
-    ) -> tuple[SuspectedBias, ...]:
-        """Return the bias by every suspect.
-
-        Args:
-            every: also what is zero on all points.
-        """
-        problem, x = self.problem, self.weighed.points.x
-        suspects = [suspect.sampled(problem.record.sampling_time) for suspect in suspects]
-        with np.errstate(all="ignore"):
-            deltas = suspect_columns(suspects, x, problem.layout, problem.outputs, self.lengths)
-        kept = [i for i in range(len(suspects)) if every or np.any(deltas[i])]
-        chosen = [suspects[i] for i in kept]
-        return bias_table(
-            self.weighed.projection,
-            problem.baseline.names,
-            chosen,
-            deltas[kept],
-            gain=self.weighed.unit,
-            theta=self.theta,
-            physical=None if self.slopes is None else self.slopes[0],
-            learned=self.learned,
-            certify=certify,
-            directions=self.directions,
-            absorbed=None if self.directions is None else self._absorbed_effects(chosen),
-        )
+    @property
+    def bounds(self) -> Matrix:
+        return np.array([[p.min, p.max] for p in self.problem.baseline.parameters])
 
     @cached_property
-    def lengths(self) -> tuple[int, ...] | None:
-        """Rows of each experiment, where the points are the training rows; else None."""
-        problem = self.problem
-        return problem.lengths if self.weighed.points.x is problem.rows.x else None
+    def catalogue(self) -> Catalogue:
+        """The terms that no one named."""
+        return Catalogue.of_problem(self.problem)
+
+    @property
+    def certifies(self) -> bool:
+        return len(self.weighed.points.x) <= CERTIFIED_ROWS
+
+    @property
+    def linearization(self) -> Linearization:
+        return self._linearization
+
+    @cached_property
+    def _linearization(self) -> Linearization:
+        projection = self.weighed.projection
+        count = projection.q.shape[0] * projection.q.shape[1]
+        require_rank(excitation(projection.r, self.names), count)
+        learner = None if self.learned is None else self._weigh(self.learned)
+        return Linearization(projection, self.directions, learner)
+
+    def equation(self, suspect: Suspect) -> None:
+        return None
 
     def values(self, suspect: Suspect) -> Matrix:
-        """Return δ (M, ny) of a suspect at the measure's points."""
-        problem = self.problem
-        own = (self.weighed.points.x, problem.layout, problem.outputs, self.lengths)
-        return suspect.sampled(problem.record.sampling_time).values(*own)
+        problem, x = self.problem, self.weighed.points.x
+        lengths = problem.lengths if x is problem.rows.x else None  # else they are no record
+        found = self._sampled(suspect).values(x, problem.layout, problem.outputs, lengths)
+        return self._weigh(found)
 
-    def without(self, entry: SuspectedBias) -> MeasureLinearization:
-        """Return the linearization less the part of the learner that a suspect explains."""
-        held = (
-            self.values(entry.suspect)
-            if self.directions is None
-            else self._absorbed_effects([entry.suspect])[0].held
-        )
-        return replace(
-            self, learned=np.asarray(self.learned) - (entry.coefficient_found or 0.0) * held
-        )
-
-    def _absorbed_effects(self, suspects: Sequence[Suspect]) -> list[TermAfterFit]:
-        problem = self.problem
-        layout, outputs = problem.layout, problem.outputs
-
+    def sees(self, suspects: Sequence[Suspect]) -> list[bool | None]:
+        """Return None where the learner could imitate every change of θ: then all is the split."""
+        if self.directions is None:
+            return [None] * len(suspects)
+        problem, layout = self.problem, self.problem.layout
         static = [suspect for suspect in suspects if suspect.memory is None]
 
         def forms(x: Matrix) -> Matrix:
-            return np.stack([suspect.form(x, layout) for suspect in static], axis=-1)
+            return np.stack([self._sampled(one).form(x, layout) for one in static], axis=-1)
 
-        def term(suspect: Suspect) -> Callable[[Matrix], Matrix]:
-            if suspect.memory is None:
-                return lambda x: suspect.values(x, layout, outputs)
-            along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
-            return lambda x: along[:: -(-len(along) // len(x))]  # on all rows, or every so many
+        seen = iter(seen_columns(problem.features, layout, problem.rows.x, forms) if static else ())
+        # A function of the past is none of one row
+        return [suspect.memory is None and bool(next(seen)) for suspect in suspects]
 
-        of_static = iter(
-            seen_columns(problem.features, layout, problem.rows.x, forms) if static else ()
+    def respond(self, suspects: Sequence[Suspect], *, run: bool) -> list[TermResponse]:
+        if self.directions is None:
+            held = [self.values(suspect) for suspect in suspects]
+            return [TermResponse(np.zeros(len(self.theta)), one, None, one) for one in held]
+        visible = [bool(seen) for seen in self.sees(suspects)]
+        terms = map(self._term, suspects)
+        effects = term_effects(self.problem, terms, visible, self.weighed.points.x)
+        weighed = ((effect, self._weigh(effect.held)) for effect in effects)
+        return [TermResponse(effect.moved, held, effect.seen, held) for effect, held in weighed]
+
+    def expected_shifts(self, bias: Vector) -> dict[str, dict[str, float | None]] | None:
+        """Return p of θ̂ less p without the bias."""
+        if self.map is None:
+            return None
+        biased, true = (
+            physical_of(self.map, self.problem, t) for t in (self.theta, self.theta - bias)
         )
-        visible = [suspect.memory is None and bool(next(of_static)) for suspect in suspects]
-        return term_effects(problem, map(term, suspects), visible, self.weighed.points.x)
+        return {
+            name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
+            for name, b, t in zip(self.map.names, biased, true, strict=True)
+        }
+
+    def considered(
+        self, declared: Sequence[Suspect], named: Sequence[SuspectedBias] | None = None
+    ) -> Iterator[Considered]:
+        """Yield the declared suspects, then the usual terms and families that the learner sees.
+
+        What it does not see counts only if it was declared: else it is no likely cause.
+        """
+        if named is None:
+            named = bias_table(self, declared, certify=False, every=False)
+        usual = seen_table(self, (*self.catalogue.usual(), *self.catalogue.two_lags()))
+        families = seen_table(self, self.catalogue.families())
+        families = [entry for entry in families if (entry.cosine or 0.0) <= MOST_PHYSICS]
+        zones = [entry.suspect for entry in (*named, *usual, *families)]
+        alike = bias_table(self, saturations(zones), certify=False, every=False)
+        every = (*named, *usual)
+        # Difference equations have no families beside declared terms: half is enough for these
+        yield Considered(named, (), (), every, (*families, *alike))
+        yield Considered(usual, (), families, every, alike)
+
+    def parts(self) -> list[tuple[str | None, LaggedTerms]]:
+        """Return for each output of which anything is learned the fit with that part alone."""
+        fit, learned, outputs = self.fit, self.learned, self.problem.outputs
+        if fit is None or learned is None or not np.all(np.isfinite(learned)):
+            return []
+        noise = fit.model.statistics.noise
+        least = 0.0 if noise is None else _NOTHING**2 * np.diag(noise)
+        something = np.mean(learned**2, axis=0) >= least
+        if len(outputs) == 1:
+            return [(None, self)] if something.any() else []
+        return [
+            (outputs[i], replace(self, learned=learned * np.eye(len(outputs))[i]))
+            for i in np.flatnonzero(something)
+        ]
+
+    def is_negligible(self, bias: Vector) -> bool:
+        """Return False: outputs of which nothing is learned are no parts."""
+        return False
+
+    def noise_share(self) -> float:
+        """Return ν, the share of noise in what the learner holds beside the physics.
+
+        Noise takes σ² for each weight that the learner uses.
+        """
+        fit, own = self.fit, np.asarray(self.linearization.unshared_learner)
+        if fit is None or fit.model.statistics.noise is None:
+            return 0.0
+        rows = np.ones((len(own), 1)) * np.sqrt(np.diag(fit.model.statistics.noise))
+        noise = np.sum(self._weigh(rows) ** 2) / own.shape[1]
+        taken = fit.effective_weights / self.problem.count * noise
+        return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
+
+    def remedies(self, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
+        """Return sentences on how to remove the bias of the named parameters, easiest first."""
+        return [*_by_inputs(self, cause, biased), *_by_measure(self, cause, biased)]
+
+    def _weigh(self, rows: Matrix) -> Matrix:
+        return times(self.weighed.unit, np.asarray(rows))
+
+    def _sampled(self, suspect: Suspect) -> Suspect:
+        return suspect.sampled(self.problem.record.sampling_time)
+
+    def _term(self, suspect: Suspect) -> Callable[[Matrix], Matrix]:
+        """Return the values (N, ny) of a term on rows of the regressor, or on every so many."""
+        problem, suspect = self.problem, self._sampled(suspect)
+        layout, outputs = problem.layout, problem.outputs
+        if suspect.memory is None:
+            return lambda x: suspect.values(x, layout, outputs)
+        along = suspect.values(problem.rows.x, layout, outputs, problem.lengths)
+        return lambda x: along[:: -(-len(along) // len(x))]
 
 
 def bias_under(
-    linearization: MeasureLinearization,
-    suspects: Sequence[Suspect] = (),
-    *,
-    certify_usual: bool = True,
+    terms: LaggedTerms, suspects: Sequence[Suspect] = (), *, certify_usual: bool = True
 ) -> list[dict[str, Any]]:
     """Return the bias by every suspect under a measure, as plain data for JSON.
-
-    It is that of θ and, to first order, of the physical parameters.
 
     Args:
         suspects: those that were named; without any, the usual ones that have an effect.
         certify_usual: seek certificates, a linear program each, for suspects that no one named,
             too.
     """
-    named, problem, points = bool(suspects), linearization.problem, linearization.weighed.points
-    table = linearization.table(
-        suspects or usual_suspects(problem),
-        certify=named or (certify_usual and len(points.x) <= CERTIFIED_ROWS),
-        every=named,
+    named = bool(suspects)
+    certify = named or (certify_usual and terms.certifies)
+    table = bias_table(terms, suspects or terms.catalogue.usual(), certify=certify, every=named)
+    return [entry.as_dict() for entry in table]
+
+
+def linearization_of(
+    fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
+) -> LaggedTerms:
+    """Return a fit for biases by terms, under the measure that θ was split under."""
+    weighed = weigh_problem(measure, fit.problem)
+    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
+    return LaggedTerms(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared, fit)
+
+
+def _by_inputs(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+    """Yield the choice of learner inputs that frees most of the parameters."""
+    problem, suspect = terms.problem, cause.suspect
+    if suspect.memory is not None:  # a function of the past is one of no inputs of one row
+        return
+    layout, x = problem.layout, problem.rows.x
+    now = {str(entry) for entry in problem.features.entries}
+    best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    for inputs in dict.fromkeys(
+        (*(((suspect.on,),) if suspect.on else ()), *other_inputs(problem))
+    ):
+        if set(inputs) == now:
+            continue
+        features = Features(tuple(parse(text, dict(problem.baseline.constants)) for text in inputs))
+        if not set(features.lags) <= set(layout):
+            continue
+        if not seen_columns(features, layout, x, lambda rows: suspect.form(rows, layout)[:, None])[
+            0
+        ]:
+            continue
+        shared = shared_directions(problem.baseline, features, layout, problem.outputs, x)
+        if shared.all:
+            continue
+        left = _bias_of(replace(terms, directions=shared.basis), suspect)
+        freed = _freed_parameters(terms, cause, left, biased)
+        if len(freed) > len(best[1]):
+            best = (inputs, freed)
+    if best[1]:
+        listed = ", ".join(f'"{text}"' for text in best[0])
+        rest = "" if len(best[1]) == len(biased) else f" for {', '.join(best[1])}"
+        yield f"set learner.inputs = [{listed}]{rest}"
+
+
+def _by_measure(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
+    """Yield a measure that brings the bias of all of them near zero."""
+    if cause.seen is False or len(terms.problem.rows) > _MEASURED_ROWS:
+        return
+    for measure in (Symmetrized(), Uniform()):
+        if measure.name == terms.weighed.measure.name:
+            continue
+        try:
+            other = replace(terms, weighed=weigh_problem(measure, terms.problem), learned=None)
+            left = _bias_of(other, cause.suspect)
+        except InputError:
+            continue
+        if len(_freed_parameters(terms, cause, left, biased)) == len(biased):
+            yield f"split under the {measure.name} measure"
+            return
+
+
+def _bias_of(terms: LaggedTerms, suspect: Suspect) -> Vector:
+    """Return the bias per unit of a suspect that the learner sees."""
+    return terms.linearization.project(terms.values(suspect))
+
+
+def _freed_parameters(
+    terms: LaggedTerms, cause: SuspectedBias, left: Vector, biased: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the parameters, physical ones by their slopes, whose bias shrinks to a small part."""
+    names, before = terms.problem.baseline.names, np.array(cause.bias)
+    rows = dict(zip(names, np.eye(len(names)), strict=True)) | (
+        terms.physical[0] if terms.physical else {}
     )
-    found = []
-    for entry in table:
-        delta = linearization.values(entry.suspect)
-        own = {
-            "relative_physical_bias": _relative(entry, linearization.slopes),
-            "size": float(np.linalg.norm(times(linearization.weighed.unit, delta))),
-            "expected_physical_bias": _expected_shifts(
-                entry, linearization.physics, problem, linearization.theta
-            ),
-        }
-        found.append(entry.as_dict() | own)
-    return found
-
-
-def _expected_shifts(
-    entry: SuspectedBias, physics: PhysicsMap | None, problem: Problem, theta: Vector
-) -> dict[str, dict[str, float | None]] | None:
-    """Return the shift of each physical parameter by the guessed coefficient.
-
-    It is p of θ̂ less p without the bias.
-    """
-    if physics is None or entry.expected is None:
-        return None
-    biased, true = (
-        physical_of(physics, problem, t) for t in (theta, theta - np.array(entry.expected))
+    return tuple(
+        name for name in biased if abs(rows[name] @ left) <= _REMOVED * abs(rows[name] @ before)
     )
-    return {
-        name: {"bias": float(b - t), "relative": float((b - t) / t) if t else None}
-        for name, b, t in zip(physics.names, biased, true, strict=True)
-    }
-
-
-def _relative(
-    entry: SuspectedBias, slopes: tuple[dict[str, Vector], Vector] | None
-) -> dict[str, float | None] | None:
-    """Return the bias of each physical parameter over its value."""
-    if slopes is None or entry.physical is None:
-        return None
-    return {
-        name: bias / p if p else None
-        for (name, bias), p in zip(entry.physical, slopes[1], strict=True)
-    }
-
-
-def physical_slopes(
-    physics: PhysicsMap | None, problem: Problem, theta: Vector
-) -> tuple[dict[str, Vector], Vector] | None:
-    """Return dp/dθ, in the order of the baseline's θ, at the p that θ gives; and that p."""
-    if physics is None:
-        return None
-    p = physical_of(physics, problem, theta)
-    # Scales of θ and p, so that the pseudo-inverse sees numbers of one size
-    of_theta = np.abs(physics.theta(p))
-    of_theta, of_p = np.where(of_theta > 0, of_theta, 1.0), np.where(p != 0, np.abs(p), 1.0)
-    inverse = np.linalg.pinv(physics.jacobian(p) / of_theta[:, None] * of_p)
-    rows = np.zeros((len(p), len(problem.baseline.names)))
-    rows[:, _order(physics, problem)] = inverse * of_p[:, None] / of_theta
-    return dict(zip(physics.names, rows, strict=True)), p
-
-
-def physical_of(
-    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
-) -> Vector:
-    """Return p of θ, weighted by its covariance where that is given."""
-    return _solve_physical(physics, problem, theta, covariance).value
-
-
-def _solve_physical(
-    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None
-) -> PhysicalEstimate:
-    order = _order(physics, problem)
-    covariance = None if covariance is None else covariance[np.ix_(order, order)]
-    return solve(physics, theta[order], covariance, freedom=np.inf)
-
-
-def physical_with_bias(
-    linearization: MeasureLinearization,
-    bias: Vector,
-    covariance: Matrix | None,
-    spread: Matrix,
-    freedom: float,
-) -> tuple[Vector, Matrix]:
-    """Return biases of the physical parameters (np,), and ends (np, 2) of 95 % intervals.
-
-    The intervals cover bias and noise.
-
-    The interval of p is that of θ in the direction in which p moves most, mapped: p of both of its
-    ends, or p's bound where an end has none. Biases are NaN where θ̂ less its bias has no p.
-
-    Args:
-        bias: of θ̂.
-        covariance: of θ̂, by which p is weighted; `spread` counts also what is not known of the
-            bias.
-    """
-    physics, problem = linearization.physics, linearization.problem
-    assert physics is not None
-    centre, order = linearization.theta - bias, _order(physics, problem)
-    now, free = (
-        _solve_physical(physics, problem, theta, covariance)
-        for theta in (linearization.theta, centre)
-    )
-    ends = np.full((len(free.value), 2), np.nan)
-    if not _is_met(free):
-        return ends[:, 0], ends
-    if free.sensitivities is None or covariance is None:
-        return now.value - free.value, ends
-    slopes, at_bounds = (
-        np.zeros((len(free.value), len(centre))),
-        physical_slopes(physics, problem, centre),
-    )
-    assert at_bounds is not None
-    with np.errstate(all="ignore"):
-        slopes[:, order] = free.sensitivities * free.value[:, None] / centre[order]
-    for i, row in enumerate(slopes):
-        row = row if np.isfinite(row).all() and row.any() else at_bounds[0][physics.names[i]]
-        size = np.sqrt(row @ spread @ row)
-        step = reach(freedom) * spread @ row / (size if size > 0 else 1.0)
-        for side, sign in enumerate((-1.0, 1.0) if np.isfinite(step).all() else ()):
-            end = _solve_physical(physics, problem, centre + sign * step, covariance)
-            beyond = sign * (end.value[i] - free.value[i]) >= -_ROUNDING * abs(free.value[i])
-            ends[i, side] = end.value[i] if _is_met(end) and beyond else physics.bounds[side][i]
-    return now.value - free.value, ends
-
-
-def _is_met(found: PhysicalEstimate) -> bool:
-    """Return whether there is p that gives θ."""
-    return all(warning.code != "physics_not_met" for warning in found.warnings)
-
-
-def _order(physics: PhysicsMap, problem: Problem) -> list[int]:
-    return [problem.baseline.names.index(name) for name in physics.theta_names]

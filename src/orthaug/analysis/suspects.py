@@ -1,7 +1,9 @@
-"""Suspected unmodelled terms δ(x): friction, drag, hardening, as expressions of raw lags.
+"""Suspected unmodelled terms: friction, drag, hardening, of raw lags or of a motion's names.
 
 They are the "suspected unmodeled terms" of the paper's remark after `cond:special_PE`: what the
-physics leaves out by intention, known in form though not in size.
+physics leaves out by intention, known in form though not in size. A `Suspect` δ(x) adds to an
+output; a `MotionSuspect` adds to the derivative of a state, or to an output. With a `factor` such
+as -1/m its coefficient is a force in N though the equation is one of m/s².
 """
 
 from __future__ import annotations
@@ -13,11 +15,26 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector, check_number, check_unique, is_number, nearest
+from orthaug._base.checks import (
+    Matrix,
+    Vector,
+    check_label,
+    check_number,
+    check_unique,
+    is_number,
+    nearest,
+)
 from orthaug._base.errors import InputError
-from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse
+from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse, parse_named
 from orthaug.data.regressors import Layout
-from orthaug.physics.problem import Problem
+from orthaug.physics.motion import Motion
+from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.suspected_motion import (
+    Signal,
+    SuspectedTerm,
+    equations_of,
+    usual_places,
+)
 
 if TYPE_CHECKING:
     from orthaug.analysis.memory import MemoryTerm
@@ -35,7 +52,7 @@ def _clip(x: str, w: str) -> str:
     return f"max(min({x}, {w}), -{w})"
 
 
-# (x) is in parentheses wherever an operator touches it; function arguments need none.
+# (x) is in parentheses wherever an operator touches it
 _KINDS = {
     "coulomb": _Kind(lambda x, w: f"sign({x})"),
     "stribeck": _Kind(lambda x, w: f"sign({x})*exp(-abs({x})/{w})", width=True),
@@ -53,22 +70,13 @@ _KINDS = {
     "bouc_wen": _Kind(lambda x, w: x, width=True, memory=True),
 }
 KINDS = tuple(_KINDS)
-WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
 WITH_MEMORY = tuple(kind for kind, entry in _KINDS.items() if entry.memory)
+WIDTHS = tuple(kind for kind, entry in _KINDS.items() if entry.width)  # the kinds that need a width
 # The kinds that jump where their argument changes sign
 ODD_JUMPS = ("coulomb", "stribeck", "stribeck_gauss")
-_VELOCITY = ("coulomb", "stribeck", "quadratic_drag", "cubic")
-_POSITION = ("cubic", "dead_zone")
-_SINGLE = (
-    *_POSITION,
-    "saturation",
-    "coulomb",
-)  # of an output read at one lag only, which may be a velocity
 _CLEARLY = 0.05  # of the largest value
 # Of the largest value: what is only so far below 0 counts as positive, for it is noise
 _BELOW = 0.05
-_MULTIPLIED = 6  # lags at most, of which products are tried
-_INPUT = ("cubic", "dead_zone", "saturation")
 
 
 @dataclass(frozen=True)
@@ -102,9 +110,11 @@ class Suspect:
     on: str | None = None
     memory: MemoryTerm | None = None
 
+    equation = unit = None  # in the words of a motion's suspects
+
     def __post_init__(self) -> None:
         check_name(self.name)
-        if self.output is not None and not isinstance(self.output, str):
+        if not isinstance(self.output, str | None):
             raise InputError(
                 f"suspect '{self.name}': `output` must be the name of a channel; got "
                 f"{self.output!r}."
@@ -232,7 +242,7 @@ class Suspect:
             InputError: lags that the layout lacks, a term with memory on points that are no record.
         """
         with np.errstate(all="ignore"):
-            found = _evaluate(self.parsed, x, layout, f"suspect '{self.name}'")
+            found = evaluate_rows(self.parsed, x, layout, f"suspect '{self.name}'")
         if self.memory is None:
             return found
         if lengths is None:
@@ -256,6 +266,129 @@ class Suspect:
                 f"suspect '{self.name}': unknown output '{self.output}'{hint}; known are {known}."
             )
         return list(outputs).index(self.output)
+
+
+@dataclass(frozen=True)
+class MotionSuspect:
+    """A term `coefficient * expression` of a state's equation, or of an output.
+
+    Make one of a known kind with `of`.
+
+    `coefficient` is a guess of its size, None where there is none; `unit` is its unit. `equation`
+    may be left out where one state is learned, or only one equation has parameters.
+
+    Examples:
+        >>> force = {"factor": "-1/m", "equation": "v", "coefficient": 1.5, "unit": "N"}
+        >>> MotionSuspect.of("coulomb", "v", **force).expression
+        '(-1/m)*(sign(v))'
+    """
+
+    name: str
+    expression: str
+    equation: str | None = None
+    coefficient: float | None = None
+    unit: str = ""
+    jump: str | None = None
+    """What changes its sign where the expression jumps, of the kind `coulomb`."""
+    memory: MemoryTerm | None = None
+    """What the expression drives along the run; the term is `factor` times its internal state."""
+    factor: str | None = None
+    """Of a term with memory; of another it is part of the expression."""
+
+    output = on = None  # in the words of lagged suspects
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+        check_coefficient(self.name, self.coefficient)
+        check_label(self.unit, f"the unit of suspect '{self.name}'")
+
+    @classmethod
+    def of(
+        cls,
+        kind: str,
+        on: str | None = None,
+        *,
+        width: float | None = None,
+        time_constant: float | None = None,
+        factor: str | None = None,
+        equation: str | None = None,
+        coefficient: float | None = None,
+        unit: str = "",
+        name: str | None = None,
+    ) -> MotionSuspect:
+        """Return a suspect of a known kind (those of `Suspect.of`), times a factor.
+
+        Args:
+            on: an expression of states, inputs, parameters and definitions, such as `"v"`.
+            width: in the unit of `on`.
+            time_constant: of a lag, in s.
+            factor: an expression that multiplies the kind's.
+
+        Raises:
+            InputError: an unknown kind, an argument that is missing, or that the kind does not
+                take.
+        """
+        text, label, _ = suspect_text(kind, on, width, _check_parentheses, "v", time_constant)
+        memory = memory_of(kind, on, width, time_constant)
+        if factor is not None:
+            _check_parentheses(factor)
+            label = f"{factor} * {label}"
+            text = text if memory is not None else f"({factor})*({text})"
+        if memory is not None:
+            own = (label if name is None else name, text, equation, coefficient, unit)
+            return cls(*own, memory=memory, factor=factor)
+        jump = " ".join(on.split()) if kind == "coulomb" and on is not None else None
+        return cls(label if name is None else name, text, equation, coefficient, unit, jump)
+
+    def parsed(self, motion: Motion) -> Expression:
+        """Return the expression on the motion's names.
+
+        Raises:
+            InputError: names that the motion does not have, what is no arithmetic.
+        """
+        return parse_named(self.expression, motion.known, f"suspect '{self.name}'")
+
+    def place(self, motion: Motion) -> int:
+        """Return the number of its equation, outputs after states.
+
+        Raises:
+            InputError: an unknown equation, or none where there are several.
+        """
+        known = equations_of(motion)
+        if self.equation is not None:
+            if self.equation not in known:
+                hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
+                raise InputError(
+                    f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}."
+                )
+            return known.index(self.equation)
+        likely = usual_places(motion)
+        if len(likely) != 1:
+            raise InputError(
+                f"suspect '{self.name}': `equation` is missing; one of {', '.join(known)}."
+            )
+        return likely[0]
+
+    def term(self, motion: Motion) -> SuspectedTerm:
+        """Return the suspect as a term of the motion.
+
+        Raises:
+            InputError: as `parsed` and `place`.
+        """
+        parsed = self.parsed(motion)
+        if self.memory is None:
+            return SuspectedTerm(self.name, self.place(motion), parsed)
+        factor = parse_named(self.factor or "1", motion.known, f"suspect '{self.name}'")
+        return SuspectedTerm(self.name, self.place(motion), factor, Signal(parsed, self.memory))
+
+    def values(self, motion: Motion, p: Vector, x: Matrix, u: Matrix) -> Vector:
+        """Return the expression (M,) at states (M, nx) and inputs (M, nu), finite or not.
+
+        Of a term with memory it is what drives the memory.
+        """
+        with np.errstate(all="ignore"):
+            found = self.parsed(motion).value(motion.values(x.T, u.T, p, np), np)
+        return np.broadcast_to(np.asarray(found, dtype=float), (len(x),))
 
 
 def check_name(name: Any) -> None:
@@ -373,59 +506,39 @@ def data_width(
             rows.
     """
     with np.errstate(all="ignore"):
-        size = np.abs(_evaluate(parse(on, constants), x, layout, f"'{on}'"))
+        size = np.abs(evaluate_rows(parse(on, constants), x, layout, f"'{on}'"))
     if not np.all(np.isfinite(size)):
         raise InputError(
             f"'{on}' is not finite at row {np.flatnonzero(~np.isfinite(size))[0]} of the regressor."
         )
-    if not np.any(size > 0):
+    width = median_size(size)
+    if width is None:
         raise InputError(f"'{on}' is zero on all rows; the data give no width. State one.")
+    return width
+
+
+def median_size(values: np.ndarray) -> float | None:
+    """Return the median of nonzero |values| to six digits; None of zeros, or not finite ones."""
+    size = np.abs(values)
+    if not np.isfinite(size).all() or not np.any(size > 0):
+        return None
     return float(f"{np.median(size[size > 0]):.6g}")
 
 
-def usual_suspects(problem: Problem) -> tuple[Suspect, ...]:
-    """Return the usual suspects: friction, drag, hardening, dead zone, saturation, offset, root."""
-    layout, outputs = problem.layout, problem.outputs
-    pairs: list[tuple[str, str]] = []
-    for channel in dict.fromkeys(lag.channel for lag in layout):
-        lags = sorted(lag for lag in layout if lag.channel == channel)
-        first = str(lags[0])
-        kinds = _POSITION if len(lags) > 1 else _SINGLE
-        pairs += [(kind, first) for kind in (kinds if channel in outputs else _INPUT)]
-        values = problem.rows.x[:, layout.index(lags[0])]
-        if channel in outputs and is_level(values):
-            pairs.append(("square_root", first))
-        if channel in outputs and len(lags) > 1:
-            pairs += [(kind, f"{first} - {lags[1]}") for kind in _VELOCITY]
-    suspects = []
-    values = {on: _evaluate(parse(on), problem.rows.x, layout, f"'{on}'") for _, on in pairs}
-    pairs = [(kind, on) for kind, on in pairs if kind not in ODD_JUMPS or changes_sign(values[on])]
-    for output in outputs:
-        own = output if len(outputs) > 1 else None
-        label = f" in {output}" if own else ""
-        for kind, on in pairs:
-            width = data_width(on, problem.rows.x, layout) if kind in WIDTHS else None
-            suspects.append(
-                Suspect.of(kind, on, width=width, output=output, name=f"{kind} of {on}{label}")
+def check_motion_suspects(suspects: Sequence[MotionSuspect], problem: MotionProblem) -> None:
+    """Raise InputError for suspects that the motion cannot have, or without a value somewhere."""
+    motion, (x, u) = problem.motion, problem.guessed_points
+    check_unique((suspect.name for suspect in suspects), "suspect")
+    for suspect in suspects:
+        suspect.place(motion)
+        values = suspect.values(motion, motion.initial, x.T, u.T)
+        if not np.isfinite(values).all():
+            k = int(np.argmax(~np.isfinite(values)))
+            at = zip((*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True)
+            where = ", ".join(f"{name} = {value:.4g}" for name, value in at)
+            raise InputError(
+                f"suspect '{suspect.name}' = {suspect.expression} is not finite at {where}."
             )
-        suspects.append(Suspect.of("offset", output=output, name=f"offset{label}"))
-    return tuple(suspects)
-
-
-def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:
-    """Return a saturation for each dead zone, the rest of its channel.
-
-    Data of a physics with that channel cannot distinguish the two.
-    """
-    zones = [suspect for suspect in suspects if suspect.name.startswith("dead_zone")]
-    return [
-        replace(
-            s,
-            name=s.name.replace("dead_zone", "saturation"),
-            expression=f"{s.on} - ({s.expression})",
-        )
-        for s in zones
-    ]
 
 
 def changes_sign(values: Vector) -> bool:
@@ -442,20 +555,8 @@ def is_level(values: Vector) -> bool:
     return bool(np.min(values) >= -_BELOW * np.max(values))
 
 
-def usual_terms(problem: Problem) -> tuple[Suspect, ...]:
-    """Return products of two lags of physics or learner, for effects beyond the usual suspects."""
-    lags, outputs = problem.used[:_MULTIPLIED], problem.outputs
-    pairs = [(one, other) for i, one in enumerate(lags) for other in lags[i:]]
-    texts = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
-    only = len(outputs) == 1
-    return tuple(
-        Suspect(text if only else f"{text} in {output}", text, output)
-        for output in outputs
-        for text in texts
-    )
-
-
-def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
+def evaluate_rows(expression: Expression, x: Matrix, layout: Layout, what: str) -> np.ndarray:
+    """Return an expression on rows of the regressor (N,), finite or not."""
     missing = [str(lag) for lag in expression.lags if lag not in layout]
     if missing:
         held = ", ".join(map(str, layout))
@@ -465,6 +566,19 @@ def _evaluate(expression: Expression, x: Matrix, layout: Layout, what: str) -> n
         )
     values = expression.evaluate({lag: x[:, j] for j, lag in enumerate(layout)}, np)
     return np.broadcast_to(np.asarray(values, dtype=float), (len(x),))
+
+
+def _check_parentheses(text: str) -> None:
+    """Raise InputError where parentheses are no pairs: names are checked with the motion."""
+    depth = 0
+    for letter in text:
+        depth += (letter == "(") - (letter == ")")
+        if depth < 0:
+            break
+    if depth or not text.strip():
+        raise InputError(
+            f"'{text}' is no expression: its parentheses do not match, or it is empty."
+        )
 
 
 def _checked_constants(

@@ -10,10 +10,12 @@ import numpy as np
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
+from orthaug.analysis.input_timing import DeadTime
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import ResidualTest
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
@@ -36,6 +38,7 @@ _OFF = (
     "The errors are coloured by enough to make the one-step θ inconsistent (warning "
     "`inconsistent`)."
 )
+_LITTLE = 0.005  # of a free run's variance: a share by its own past below that is none
 _COLOUR = 0.1  # of the residual's variance by its own past: from there on that bias may matter
 
 
@@ -370,3 +373,104 @@ def _colour_warning(what: str) -> Warning:
         "only a rough guide."
     )
     return Warning("coloured_residual", text)
+
+
+def free_run_words(
+    verdict: str,
+    fit: MotionEstimate,
+    tests: tuple[ResidualTest, ...],
+    shares: tuple,
+    followed: dict,
+    curved: dict,
+    lacks: MissingTest | None,
+    late: tuple[DeadTime, ...],
+) -> str:
+    """Return the verdict on a motion's free run in words, with its reason."""
+    units = {c.name: c.unit for c in fit.problem.record.outputs}
+    sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
+    if verdict == "white":
+        noise = "is white: noise on the outputs, which the training assumes."
+        return f"The free run's error ({sizes}) {noise}{small_effects(tests, shares)}"
+    if verdict == "equation_noise":
+        learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
+        no_input = "no input, " if fit.problem.motion.inputs else ""
+        colour = describe_colour(tests, shares)
+        return (
+            f"The free run's error ({sizes}) is coloured ({colour}). It follows {no_input}no state "
+            "at the same instant, and no simple missing term. Its cause is "
+            f"disturbances, or physics missing in an equation {learner}."
+        )
+    if late:
+        return (
+            f"The free run's error ({sizes}) contains more than noise. Most likely "
+            f"{late[0].input} acts later than in the equations: {late[0].gain}."
+        )
+    if lacks is not None:
+        return f"The free run's error ({sizes}) contains more than noise. {_name_terms(lacks)}"
+    what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
+    what += [f"{name} varies with {', '.join(given)}" for name, given in curved.items()]
+    what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
+    held = "Physics is missing" + (
+        ", or inputs move differently between samples" if fit.problem.motion.inputs else ""
+    )
+    return f"The free run's error ({sizes}) contains more than noise: {'; '.join(what)}. {held}."
+
+
+def small_effects(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
+    """Return a sentence on significant effects that are too small to matter."""
+    effects = [
+        f"{test.name} follows {', '.join(test.correlated_inputs)}"
+        for test in tests
+        if test.correlated_inputs
+    ]
+    effects += [
+        f"{test.name} varies with {', '.join(over)}"
+        for test in tests
+        if (over := test.curved_over(0.0))
+    ]
+    if not effects:
+        return ""
+    most = max(share.largest(own_past=False) for share in shares)
+    return (
+        f" Tests still detect small effects ({'; '.join(effects)}): {percent(most)} of its "
+        "mean square at most."
+    )
+
+
+def describe_colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
+    """Return for each coloured output its largest autocorrelation and its predictable share."""
+    clauses = []
+    for test, share in zip(tests, shares, strict=True):
+        if not test.practically_white():
+            past = f", and {percent(share.own_past)} of it follows from its own past"
+            past = (
+                past if share.own_past > _LITTLE else ", too little to predict it from its own past"
+            )
+            clauses.append(
+                f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in "
+                f"magnitude{past}"
+            )
+    return "; ".join(clauses)
+
+
+def _name_terms(lacks: MissingTest) -> str:
+    """Return the terms that are most likely missing."""
+    best, *others = lacks.terms
+    text = f"Most likely {best} would explain {percent(best.share)} of its mean square"
+    if others:
+        text += (
+            ", as would "
+            f"{' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+        )
+    return f"{text}."
+
+
+def colour_sentence(fit: MotionEstimate) -> str:
+    """Return a sentence on coloured errors, and on the standard errors that follow."""
+    text = "the errors of the free run are coloured: judge the model by held-out errors"
+    if fit.std is None or fit.plain_covariance is not None:
+        return f"{text}."
+    return (
+        f"{text}. The rows are too few for robust standard errors: those given assume white errors "
+        "and are a rough guide."
+    )

@@ -9,7 +9,8 @@ import numpy as np
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_file
-from orthaug.analysis.design import MOST_SAMPLES, Design
+from orthaug.analysis.design import MOST_SAMPLES
+from orthaug.analysis.input_search import Design
 from orthaug.commands.job import Job
 
 

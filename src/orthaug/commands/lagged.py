@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.analysis.measure_bias import MeasureLinearization, bias_under
+from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.suspects import Suspect
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.job import Job, JobPhysics, Variant
@@ -385,9 +385,9 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
         """
         if not job.problem.baseline.names:
             return []
-        linearization = self._linearization(job, fit)
-        suspects = declare_suspects(job.spec.suspects, linearization.problem)
-        return bias_under(linearization, suspects, certify_usual=fit is None)
+        terms = self._terms(job, fit)
+        suspects = declare_suspects(job.spec.suspects, terms.problem)
+        return bias_under(terms, suspects, certify_usual=fit is None)
 
     def _budget(self, job: Job, fit: Estimate) -> Budget | None:
         """Return the bias that what the learner found implies, under the spec's measure."""
@@ -395,26 +395,21 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
 
         if fit.model.structure != "orthogonal":
             return None
-        linearization = self._linearization(job, fit)
-        suspects = declare_suspects(job.spec.suspects, linearization.problem)
-        return budget_on(linearization, fit, suspects)
+        terms = self._terms(job, fit)
+        return budget_on(terms, declare_suspects(job.spec.suspects, terms.problem))
 
-    def _linearization(self, job: Job, fit: Estimate | None) -> MeasureLinearization:
+    def _terms(self, job: Job, fit: Estimate | None) -> LaggedTerms:
         problem, weighed, structure = job.problem, self.weighed, job.spec.declared_structure()
         assert weighed is not None
         if fit is None:
             learns = job.spec.declared_learner() is not None
             along = directions(structure, problem) if learns else None
-            return MeasureLinearization(
-                weighed, problem, problem.least_squares, self.map, None, along
-            )
+            return LaggedTerms(weighed, problem, problem.least_squares, self.map, None, along)
         if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors of the fit
             problem = fit.problem
             weighed = weigh_problem(job.measure, problem)
         learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
-        return MeasureLinearization(
-            weighed, problem, fit.theta, self.map, learned, fit.model.shared
-        )
+        return LaggedTerms(weighed, problem, fit.theta, self.map, learned, fit.model.shared, fit)
 
 
 def _is_same(term: Mapping[str, Any], expression: str, place: str | None) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
-from orthaug.analysis.motion_suspects import MotionSuspect
+from orthaug.analysis.suspects import MotionSuspect
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.job import Job, JobPhysics, Variant
 from orthaug.commands.scales import describe_scales
@@ -91,7 +91,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
 
         None where the equation has the term already, or for a term of an output.
         """
-        from orthaug.analysis.motion_suspects import equations_of, usual_places
+        from orthaug.physics.suspected_motion import equations_of, usual_places
 
         motion = self.motion
         if place is None:
@@ -261,8 +261,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         free_run: Response,
         warnings: list[Any],
     ) -> dict[str, Any]:
+        from orthaug.analysis.diagnosis import diagnose
         from orthaug.analysis.learned_part import equation_parts
-        from orthaug.analysis.motion_diagnosis import diagnose_motion
         from orthaug.analysis.motion_modes import motion_stability
         from orthaug.analysis.motion_response import substep_bias
 
@@ -271,7 +271,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         found: dict[str, Any] = {
             "residuals": attempt_warned(
                 "the analysis of the residual",
-                lambda: diagnose_motion(fit, free_run),
+                lambda: diagnose(fit, free_run=free_run),
                 warnings,
                 _NOT_ANALYSED,
             ),
@@ -341,7 +341,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
 
     def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
         """Return the input that is asked for, by the parameters of physics alone."""
-        from orthaug.analysis.motion_design import design_motion_input
+        from orthaug.analysis.design import design_motion_input
         from orthaug.fitting.motion_task import MotionTask
 
         spec, motion = job.spec, job.problem.motion
@@ -368,21 +368,26 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
 
         None where physics alone has no run.
         """
-        from orthaug.analysis.motion_bias import linearize_physics
+        from orthaug.analysis.bias import bias_table
+        from orthaug.analysis.free_run_bias import linearize_physics
 
-        linearization = linearize_physics(trial.task, job.structure)
-        if linearization is None:
+        terms = linearize_physics(trial.task, job.structure)
+        if terms is None:
             return None
-        table = linearization.table(self.suspects or linearization.usual())
+        table = bias_table(terms, self.suspects or terms.usual())
         return [entry.as_dict() for entry in table if self.suspects or entry.size]
 
     def _biases(self, fit: MotionEstimate) -> tuple[list[dict[str, Any]] | None, Any]:
         """Return the table of suspects and of the causes in the budget, and the budget."""
-        from orthaug.analysis.motion_bias import suspected_bias
-        from orthaug.analysis.motion_budget import declared_budget
+        from orthaug.analysis.bias import bias_table
+        from orthaug.analysis.budget import budget_on
+        from orthaug.analysis.free_run_bias import linearize_fit
 
-        table = suspected_bias(fit, self.suspects) if self.suspects else []
-        budget = declared_budget(fit, self.suspects, table)
+        terms = linearize_fit(fit)
+        if terms is None:
+            return None, None
+        table = bias_table(terms, self.suspects)
+        budget = budget_on(terms, self.suspects, table)
         listed = {entry.suspect for entry in table}
         usual = [
             cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed

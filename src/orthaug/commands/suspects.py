@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from orthaug.analysis.motion_suspects import MotionSuspect, check_motion_suspects, motion_width
-from orthaug.analysis.suspects import WIDTHS, Suspect, data_width, suspect_columns
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
+from orthaug.analysis.suspects import (
+    WIDTHS,
+    MotionSuspect,
+    Suspect,
+    check_motion_suspects,
+    data_width,
+    median_size,
+    suspect_columns,
+)
 from orthaug.commands.spec import SuspectSection
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.inference.measures import WeighedPhysics
+from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
 from orthaug.physics.problem import Problem
 
@@ -67,10 +77,27 @@ def declared_terms(
     for section in sections:
         kept = ("time_constant", "factor", "equation", "coefficient", "unit", "name")
         options = {key: getattr(section, key) for key in kept}
-        width = _width(section, lambda on: motion_width(on, problem.motion, x.T, u.T))
+        width = _width(section, lambda on: _motion_width(on, problem.motion, x.T, u.T))
         suspects.append(MotionSuspect.of(section.kind, section.on, width=width, **options))
     check_motion_suspects(suspects, problem)
     return tuple(suspects)
+
+
+def _motion_width(on: str, motion: Motion, x: Matrix, u: Matrix) -> float:
+    """Return a width from states x (M, nx) and inputs u (M, nu): the median of nonzero |on|.
+
+    It is rounded to six digits.
+
+    Raises:
+        InputError: an expression that cannot be read, that is not finite, or zero everywhere.
+    """
+    width = median_size(MotionSuspect(on, on).values(motion, motion.initial, x, u))
+    if width is None:
+        raise InputError(
+            f"'{on}' is zero or not finite over the guessed states; give a `width`, or its "
+            "state a `start`."
+        )
+    return width
 
 
 def _width(section: SuspectSection, found: Callable[[str], float]) -> float | None:

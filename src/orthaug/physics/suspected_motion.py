@@ -124,3 +124,17 @@ class SuspectedMotion(Motion):
             if values is None
             else xp.stack([xp.broadcast_to(row, x.shape[1:]) for row in found])
         )
+
+
+def equations_of(motion: Motion) -> tuple[str, ...]:
+    """Return the names of all equations, outputs after states."""
+    return (*motion.names_of_states, *(output.name for output in motion.outputs))
+
+
+def usual_places(motion: Motion) -> tuple[int, ...]:
+    """Return the state equations likely to lack a term: learned ones, else with parameters."""
+    if motion.learned[0]:
+        return motion.learned[0]
+    if motion.functions is not None:
+        return tuple(range(len(motion.states)))
+    return tuple(i for i, state in enumerate(motion.states) if motion.parameters_in(state.name))

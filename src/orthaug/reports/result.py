@@ -39,7 +39,7 @@ from orthaug.reports.residual_tests import RunningTestResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.budget import ParameterBias
-    from orthaug.analysis.design import Design
+    from orthaug.analysis.input_search import Design
     from orthaug.inference.motion_split import MotionSplit
     from orthaug.inference.physical import PhysicalEstimate
 

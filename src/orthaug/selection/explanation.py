@@ -13,8 +13,7 @@ import numpy as np
 from orthaug._base.checks import Vector, check_count, check_type, is_number
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.lines import percent
-from orthaug.analysis.motion_suspects import MotionSuspect
-from orthaug.analysis.suspects import Suspect
+from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression
 from orthaug.data.record import Record
 from orthaug.data.terms import CONSTANT

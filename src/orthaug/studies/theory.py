@@ -46,7 +46,7 @@ THEORY: tuple[Statement, ...] = (
         "Physics and unmodelled term are orthogonal on the data: Σ φᵀ(x)δ(x) = 0. δ is "
         "unknown, so only suspected terms can be checked. Over a domain "
         "(eq:phi-delta-orthog-functions) it is the same under a uniform measure.",
-        "analysis.bias.bias_table, analysis.bias.find_certificate; for another measure "
+        "analysis.bias.bias_table, inference.linearization.find_certificate; for another measure "
         "inference.measures.Uniform, inference.splitting.split_by_measure",
         "tests/test_bias.py; studies static_errors and data_length: set 1 meets it, 2 in the "
         "limit, 3 never, and 3 does under the uniform measure",
