@@ -15,6 +15,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.fitting.normal_equations import Hold, OneStep
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.compiled import Options, _advance, _first_state, linearise
+from orthaug.fitting.solvers.damped_step import IDENTITY
 from orthaug.models.rows import Overlap
 from orthaug.physics.problem import pose
 from orthaug.studies import synthetic
@@ -47,9 +48,11 @@ def main() -> None:
         ) -> object:
             def one(w: object) -> object:
                 state = _first_state(
-                    w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0)
+                    w, linearise(criterion, w, arguments, overlap), jnp.asarray(0.0), IDENTITY
                 )
-                return _advance(criterion, state, arguments, options, jnp.asarray(ITERATIONS))
+                return _advance(
+                    criterion, IDENTITY, state, arguments, options, jnp.asarray(ITERATIONS)
+                )
 
             return jax.vmap(one)(ws)  # noqa: B023
 

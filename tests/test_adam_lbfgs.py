@@ -87,13 +87,13 @@ def test_linear_learner_ends_at_least_squares(structure):
 @pytest.fixture
 def seen(monkeypatch):
     """What the solver is called with."""
-    calls, original = [], AdamLBFGS.minimise
+    calls, original = [], AdamLBFGS.minimize
 
-    def minimise(solver, criterion, w, rows, physics, *, progress=None):
+    def minimize(solver, criterion, w, rows, physics, *, progress=None):
         calls.append((criterion, w, rows, physics))
         return original(solver, criterion, w, rows, physics, progress=progress)
 
-    monkeypatch.setattr(AdamLBFGS, "minimise", minimise)
+    monkeypatch.setattr(AdamLBFGS, "minimize", minimize)
     return calls
 
 

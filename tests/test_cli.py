@@ -552,12 +552,12 @@ def test_a_free_run_that_diverges_is_no_error(project):
 
 def small_run(monkeypatch, ending):
     """The solver's compiled loop replaced by one that ends as told."""
-    original = compiled.minimise
+    original = compiled.minimize_compiled
 
-    def minimise(*args):
+    def minimize(*args):
         return ending(lambda: original(*args), args[-1].progress)
 
-    monkeypatch.setattr(compiled, "minimise", minimise)
+    monkeypatch.setattr(compiled, "minimize_compiled", minimize)
 
 
 @pytest.mark.parametrize("as_json", [True, False])

@@ -12,6 +12,8 @@ from orthaug import MLP, Function, LevenbergMarquardt
 from orthaug._base.jax import jax, jnp, training_clock
 from orthaug.fitting.normal_equations import Normal, linearise
 from orthaug.fitting.solvers import compiled
+from orthaug.fitting.solvers import minimize as minimizer
+from orthaug.fitting.solvers.damped_step import IDENTITY
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Overlap
 
@@ -31,9 +33,9 @@ def regression(learner=MLP(hidden=()), ny=1, noise=0.1):  # noqa: B008
     return problem(learner, z, y, phi)
 
 
-def minimise(given, w=None, solver=LevenbergMarquardt(), **options):  # noqa: B008
+def minimize(given, w=None, solver=LevenbergMarquardt(), **options):  # noqa: B008
     w = given.bound.init(jax.random.key(3)) if w is None else w
-    return solver.minimise(
+    return solver.minimize(
         given.criterion, w, given.arguments, given.nothing, samples=SAMPLES, **options
     )
 
@@ -41,7 +43,7 @@ def minimise(given, w=None, solver=LevenbergMarquardt(), **options):  # noqa: B0
 @pytest.mark.parametrize("ny", [1, 2])
 def test_linear_learner_ends_at_least_squares(ny):
     given = regression(ny=ny)
-    run = minimise(given)
+    run = minimize(given)
     expected = np.linalg.lstsq(linear_columns(given), given.e.ravel(), rcond=None)[0]
     assert run.ending is Ending.CONVERGED and run.iterations < 50
     np.testing.assert_allclose(run.w, expected, atol=1e-8)
@@ -53,7 +55,7 @@ def test_linear_learner_ends_at_ridge_regression(ridge):
     given = regression()
     columns = linear_columns(given)
     hessian = columns.T @ columns
-    run = minimise(given, ridge=ridge)
+    run = minimize(given, ridge=ridge)
     expected = np.linalg.solve(hessian + ridge * np.eye(len(hessian)), columns.T @ given.e.ravel())
     assert run.ending is Ending.CONVERGED and run.ridge == ridge
     np.testing.assert_allclose(run.w, expected, atol=1e-8)
@@ -65,7 +67,7 @@ def test_linear_learner_ends_at_ridge_regression(ridge):
 @pytest.mark.parametrize("ridge", [0.0, 1.0])
 def test_effective_weights_are_those_of_the_end(ridge):
     given = regression(MLP(hidden=(5,)))
-    run = minimise(given, ridge=ridge)
+    run = minimize(given, ridge=ridge)
     values = np.maximum(np.linalg.eigvalsh(run.normal.hessian), 0.0)
     values = values[values > 1e-13 * values[-1]]
     np.testing.assert_allclose(run.effective, np.sum(values / (values + ridge)), rtol=1e-3)
@@ -85,7 +87,7 @@ def mackay(columns, target, samples):
 
 def test_evidence_of_a_linear_learner():
     given = regression(noise=1.0)
-    run = minimise(given, solver=LevenbergMarquardt(tolerance=1e-12), ridge=1.0, evidence=True)
+    run = minimize(given, solver=LevenbergMarquardt(tolerance=1e-12), ridge=1.0, evidence=True)
     w, alpha, gamma = mackay(linear_columns(given), given.e.ravel(), SAMPLES)
     assert run.ending is Ending.CONVERGED
     np.testing.assert_allclose(run.ridge, alpha, rtol=1e-4)
@@ -95,7 +97,7 @@ def test_evidence_of_a_linear_learner():
 
 def test_evidence_reaches_its_fixed_point_equations():
     given = regression(MLP(hidden=(5,)), noise=0.3)
-    run = minimise(
+    run = minimize(
         given, solver=LevenbergMarquardt(iterations=3000, tolerance=1e-13), ridge=1.0, evidence=True
     )
     w, values = np.asarray(run.w), np.linalg.eigvalsh(run.normal.hessian)
@@ -125,7 +127,7 @@ def relevance(columns, target, samples, groups):
 def test_relevance_of_a_linear_learner():
     given, groups = regression(noise=1.0), np.array([0, 1, 0, 1, 2])
     options = {"ridge": 1.0, "evidence": True, "groups": groups}
-    run = minimise(given, solver=LevenbergMarquardt(tolerance=1e-14), **options)
+    run = minimize(given, solver=LevenbergMarquardt(tolerance=1e-14), **options)
     w, alpha, gamma = relevance(linear_columns(given), given.e.ravel(), SAMPLES, groups)
     assert len(set(alpha.tolist())) == 3
     np.testing.assert_allclose(run.ridge, alpha, rtol=1e-3)
@@ -137,7 +139,7 @@ def test_a_weight_that_nothing_needs_falls_silent():
     noise = np.random.default_rng(1).normal(size=(2, ROWS, 1))
     z, phi = np.random.default_rng(0).uniform(-1, 1, (ROWS, 2)), noise[:1].reshape(ROWS, 1, 1)
     given = problem(MLP(hidden=()), z, z[:, :1] + 0.1 * noise[1], phi)
-    run = minimise(given, ridge=1.0, evidence=True, groups=np.arange(3))
+    run = minimize(given, ridge=1.0, evidence=True, groups=np.arange(3))
     columns = linear_columns(given)
     least_squares = np.linalg.lstsq(columns, given.e.ravel(), rcond=None)[0]
     for i in (1, 2):  # Mackay's condition: an estimate within its standard error is pruned
@@ -150,7 +152,7 @@ def test_a_weight_that_nothing_needs_falls_silent():
 
 def test_start_that_is_not_finite():
     given = regression(MLP(hidden=(5,)))
-    run = minimise(given, w=jnp.full(given.bound.size, jnp.nan))
+    run = minimize(given, w=jnp.full(given.bound.size, jnp.nan))
     assert (run.ending, run.iterations) == (Ending.NON_FINITE, 0)
 
 
@@ -169,22 +171,22 @@ def in_the_span(noise):
 @pytest.mark.parametrize("options", [{}, {"ridge": 1.0}, {"ridge": 1.0, "evidence": True}])
 @pytest.mark.parametrize("noise", [0.1, 0.0])
 def test_learner_in_the_span_of_the_physics(noise, options):
-    run = minimise(in_the_span(noise), **options)
+    run = minimize(in_the_span(noise), **options)
     assert (run.ending, run.iterations) == (Ending.SPANNED, 0)
     assert np.isfinite(run.w).all() and np.isfinite(run.effective) and np.isfinite(run.normal.loss)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.0])
 def test_loss_is_a_sum_of_squares(noise):
-    assert minimise(in_the_span(noise)).normal.loss >= 0.0
+    assert minimize(in_the_span(noise)).normal.loss >= 0.0
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_start_at_the_minimum(seed):
     """A warm start on the same data has converged, although no step descends further."""
     given = regression()
-    w = minimise(given, w=given.bound.init(jax.random.key(seed))).w
-    again = minimise(given, w=w)
+    w = minimize(given, w=given.bound.init(jax.random.key(seed))).w
+    again = minimize(given, w=w)
     assert again.ending is Ending.CONVERGED
     np.testing.assert_allclose(again.w, w, atol=1e-10)
 
@@ -192,7 +194,7 @@ def test_start_at_the_minimum(seed):
 def test_start_at_a_perfect_fit():
     given = regression()
     given = problem(MLP(hidden=()), given.z, 0.0 * given.e, given.q)
-    assert minimise(given, w=jnp.zeros(given.bound.size)).ending is Ending.CONVERGED
+    assert minimize(given, w=jnp.zeros(given.bound.size)).ending is Ending.CONVERGED
 
 
 def uphill(w, overlap):
@@ -201,7 +203,7 @@ def uphill(w, overlap):
 
 
 def test_no_step_descends():
-    run = LevenbergMarquardt().minimise(
+    run = LevenbergMarquardt().minimize(
         uphill, jnp.ones(2), (), Overlap(jnp.zeros((0, 2)), jnp.zeros(0)), samples=1
     )
     assert run.ending is Ending.NO_DESCENT
@@ -215,14 +217,14 @@ def wall(w, overlap):
 
 
 def test_trial_without_a_value_is_taken_back():
-    run = LevenbergMarquardt().minimise(
+    run = LevenbergMarquardt().minimize(
         wall, jnp.zeros(1), (), Overlap(jnp.zeros((0, 1)), jnp.zeros(0)), samples=1
     )
     assert 0.0 < run.w[0] <= 1.0 and np.isfinite(run.normal.loss)
 
 
 def test_iteration_limit():
-    run = minimise(regression(MLP(hidden=(5,))), solver=LevenbergMarquardt(iterations=4))
+    run = minimize(regression(MLP(hidden=(5,))), solver=LevenbergMarquardt(iterations=4))
     assert (run.ending, run.iterations) == (Ending.RUNNING, 4)
 
 
@@ -230,7 +232,7 @@ def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
     """By the same steps as under a longer limit, and for no longer than it falls noticeably."""
     given = regression(MLP(hidden=(5,)))
     short, long, longest = (
-        minimise(given, solver=LevenbergMarquardt(*limits, longest=last))
+        minimize(given, solver=LevenbergMarquardt(*limits, longest=last))
         for limits, last in (((8, 0.0), 8), ((8, 0.0), 40), ((40, 0.0), 40))
     )
     assert (
@@ -240,7 +242,7 @@ def test_a_run_goes_on_past_its_limit_while_the_loss_falls():
     )
     np.testing.assert_array_equal(long.w, longest.w)
     assert short.tail.noticeable and short.tail.fall > 0 and short.tail.window == 5
-    once = minimise(given, solver=LevenbergMarquardt(8, 0.0, longest=40), noticeable=1e6)
+    once = minimize(given, solver=LevenbergMarquardt(8, 0.0, longest=40), noticeable=1e6)
     assert once.iterations == 8 and not once.tail.noticeable
 
 
@@ -257,7 +259,7 @@ def test_only_the_default_limit_is_passed():
 
 def test_loss_and_overlap_belong_to_the_weights():
     given = regression(MLP(hidden=(5,)))
-    run = minimise(given, solver=LevenbergMarquardt(iterations=15))
+    run = minimize(given, solver=LevenbergMarquardt(iterations=15))
     normal = given.criterion(run.w, *given.arguments, run.normal.overlap)
     for found, expected in zip(jax.tree.leaves(run.normal), jax.tree.leaves(normal), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -265,7 +267,7 @@ def test_loss_and_overlap_belong_to_the_weights():
 
 def test_same_start_same_run():
     given = regression(MLP(hidden=(5,)))
-    first, second = (minimise(given, ridge=0.1, evidence=True) for _ in range(2))
+    first, second = (minimize(given, ridge=0.1, evidence=True) for _ in range(2))
     np.testing.assert_array_equal(first.w, second.w)
     assert first[2:6] == second[2:6]
 
@@ -279,21 +281,21 @@ def test_pauses_change_nothing(monkeypatch, seconds):
         jnp.asarray(solver.tolerance), jnp.asarray(True), jnp.asarray(float(SAMPLES))
     )
     start = compiled._first_state(
-        w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1)
+        w, linearise(given.criterion, w, given.arguments, given.nothing), jnp.asarray(0.1), IDENTITY
     )
     whole = compiled._advance(
-        given.criterion, start, given.arguments, options, jnp.asarray(solver.iterations)
+        given.criterion, IDENTITY, start, given.arguments, options, jnp.asarray(solver.iterations)
     )
 
-    monkeypatch.setattr(compiled, "_SECONDS_PER_BURST", seconds)
-    run = minimise(
+    monkeypatch.setattr(minimizer, "_SECONDS_PER_BURST", seconds)
+    run = minimize(
         given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss))
     )
     np.testing.assert_array_equal(run.w, whole.w)
     assert (run.ridge, run.iterations, run.ending) == (
         float(whole.ridge),
         int(whole.iteration),
-        Ending(int(whole.code)),
+        Ending(int(whole.control.code)),
     )
     assert told[-1] == (run.iterations, float(run.normal.loss))
     assert len(told) == (run.iterations if seconds == 0 else 5)  # one where the last window begins

@@ -24,8 +24,9 @@ from orthaug import (
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
-from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.limit import Limit
+from orthaug.fitting.solvers.minimize import SquaredResiduals, minimize
 from orthaug.physics.problem import pose
 
 ROWS, CRITERION = 600, Simulation(64, 16, 5)
@@ -171,8 +172,8 @@ def test_a_rejected_trial_leaves_nothing_behind(evidence):
         "ridge": 1.0,
         "evidence": evidence,
     }
-    plain = descend(given, p, nowhere(given), **options)
-    disturbed = descend(Rejecting(given, q), p, nowhere(given), **options)
+    plain = minimize(given, p, nowhere(given), **options)
+    disturbed = minimize(Rejecting(given, q), p, nowhere(given), **options)
     assert (
         plain.ending.code == "iteration_limit"
         and plain.point.loss < given.evaluate(p, nowhere(given)).loss

@@ -12,8 +12,9 @@ import scipy.optimize
 import scipy.signal
 
 from orthaug.fitting.colour import independent_share
-from orthaug.fitting.solvers.descent import MARQUARDT, SquaredResiduals, descend
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.limit import Limit
+from orthaug.fitting.solvers.minimize import SquaredResiduals, minimize
 
 
 @dataclass
@@ -75,7 +76,7 @@ def run(objective, p, *, physics=None, iterations=200, **options):
         "damping": MARQUARDT,
     } | options
     objective.physics = len(p) if physics is None else physics
-    end = descend(objective, np.array(p, dtype=float), None, **options)
+    end = minimize(objective, np.array(p, dtype=float), None, **options)
     hessian = None if end.linear is None else end.linear.hessian
     return Outcome(
         end.point.p,
@@ -406,3 +407,10 @@ def test_stretches_are_never_mixed():
 )
 def test_residuals_that_say_nothing_count_as_independent(residuals):
     assert independent_share(residuals) == 1.0
+
+
+def test_a_weight_that_does_nothing_is_not_effective():
+    matrix, right, _ = linear(columns=3)
+    matrix = matrix * [1.0, 1.0, 0.0]
+    end = run(LeastSquares(lambda p: matrix @ p - right, lambda p: matrix), np.zeros(3), physics=1)
+    assert end.effective == pytest.approx(1.0) and end.code == "converged" and end.p[2] == 0.0

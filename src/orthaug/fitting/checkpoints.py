@@ -22,7 +22,8 @@ from orthaug._base.folders import PARTIALS
 from orthaug._base.jax import jax
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers.compiled import State
-from orthaug.fitting.solvers.descent import Pause
+from orthaug.fitting.solvers.damped_step import StepControl
+from orthaug.fitting.solvers.minimize import Pause
 from orthaug.models.rows import Overlap
 
 EVERY = 10.0  # s
@@ -30,20 +31,10 @@ _ABOUT = "training.json"
 _FORMAT = b"orthaug state 1 "
 _HEAD = len(_FORMAT) + 65  # bytes: format, checksum, end of line
 _ONE: Any = 0
-_LEAVES = State(
-    _ONE,
-    Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)),
-    _ONE,
-    _ONE,
-    _ONE,
-    _ONE,
-    _ONE,
-    _ONE,
-    _ONE,
-    _ONE,
-)
+_CONTROL = StepControl(_ONE, _ONE, _ONE, _ONE, _ONE)
+_LEAVES = State(_ONE, Normal(_ONE, _ONE, _ONE, Overlap(_ONE, _ONE)), _CONTROL, _ONE, _ONE, _ONE)
 
-OF_DESCENT = Pause((_ONE,) * 5, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE, _ONE)
+OF_DESCENT = Pause((_ONE,) * 5, _ONE, _CONTROL, _ONE, _ONE, _ONE)
 """The form of what a descent keeps."""
 
 

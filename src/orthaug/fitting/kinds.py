@@ -34,8 +34,8 @@ class Solver(Protocol):
         ...
 
     @property
-    def minimise(self) -> Callable[..., Any]:
-        """`LevenbergMarquardt.minimise` on normal equations, else `AdamLBFGS.minimise`."""
+    def minimize(self) -> Callable[..., Any]:
+        """`LevenbergMarquardt.minimize` on normal equations, else `AdamLBFGS.minimize`."""
         ...
 
     def at_most(self, iterations: int) -> Solver:

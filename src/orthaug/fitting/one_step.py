@@ -278,7 +278,7 @@ class OneStepTask(TrainingRows):
             end = self._joint_least_squares(solver, w, physics, progress)
         else:
             joint = PaperCriterion(self.bound, structure.projects)
-            end = solver.minimise(joint, w, self.rows, physics, progress=progress)
+            end = solver.minimize(joint, w, self.rows, physics, progress=progress)
         normal = linearise(OneStep(self.bound), end.w, (self.rows, hold), self._no_overlap)
         coordinates = np.asarray(physics.start + physics.basis @ end.v) * self.rms
         coefficients = (
@@ -298,7 +298,7 @@ class OneStepTask(TrainingRows):
         unknowns = np.concatenate([np.zeros(nt), w])
         options: dict[str, Any] = {"samples": self.problem.samples, "progress": progress}
         options["noticeable"] = noticeable_in(self.problem.samples)
-        end = solver.minimise(
+        end = solver.minimize(
             JointOneStep(self.bound), unknowns, (self.rows, physics), nothing, **options
         )
         return GradientRun(end.w[:nt], end.w[nt:], end.iterations, end.ending, end.seconds)
@@ -310,7 +310,7 @@ class OneStepTask(TrainingRows):
         samples = self.problem.samples - len(self.problem.baseline.names)
         if self.engine.resident:
             criterion, arguments = OneStep(self.bound), (self.rows, hold)
-            return solver.minimise(
+            return solver.minimize(
                 criterion, w, arguments, self._no_overlap, samples=samples, **options
             )
         summed = SummedOneStep(self.engine, self.bound, self.rows, hold)

@@ -17,7 +17,7 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
 from orthaug.fitting.segments import build_segments
-from orthaug.fitting.solvers.descent import Descent
+from orthaug.fitting.solvers.minimize import Descent
 from orthaug.fitting.structures import Structure
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound

@@ -17,9 +17,10 @@ from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, TrialPoint, err
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segments import Segments, build_segments
-from orthaug.fitting.solvers.descent import MARQUARDT, Descent
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import noticeable_in
+from orthaug.fitting.solvers.minimize import Descent
 from orthaug.fitting.status import Ending
 from orthaug.inference.covariance import noise_covariance, whitening_matrix
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -159,7 +160,7 @@ class SegmentedProblem:
 
         Args:
             states: of the segments' starts at p; None for the measured ones.
-            options: of `descent.descend`.
+            options: of `minimize.minimize`.
         """
         ny = len(self.dynamics.outputs)
         options |= {

@@ -29,7 +29,7 @@ from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_lagged import SegmentedLagged, declared_settings, lagged_dynamics
 from orthaug.fitting.segmented_problem import COLOUR_ROWS, COLOURED_STEPS, TrialInMemory
 from orthaug.fitting.segments import CHUNK, Segments, begins_of, build_segments, segment_of
-from orthaug.fitting.solvers.descent import Descent
+from orthaug.fitting.solvers.minimize import Descent
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.rows import Engine
 from orthaug.physics.streamed import StreamedProblem

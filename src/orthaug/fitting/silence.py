@@ -18,7 +18,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug.fitting.held_out import HeldOutErrors, mean_square
 from orthaug.fitting.learned import TrainedLearner
-from orthaug.fitting.solvers.descent import evidence_ridge
+from orthaug.fitting.solvers.minimize import evidence_ridge
 from orthaug.fitting.status import Ending
 
 _SILENT = 0.5  # effective weights: fewer do nothing

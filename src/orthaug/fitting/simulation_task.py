@@ -23,8 +23,8 @@ from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.segmented_problem import FreeRunFit
-from orthaug.fitting.solvers.descent import LEARNED, Descent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.solvers.minimize import LEARNED, Descent
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import theta_block
 from orthaug.models.learners import Bound

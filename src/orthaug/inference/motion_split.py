@@ -166,7 +166,8 @@ def nearest(
 ) -> tuple[Vector, SharedDirections]:
     """Return q̂, which differs from c along shared directions only.
 
-    The search begins at the point of that plane that is nearest to `start`.
+    The search begins at the point of that plane that is nearest to `start`. The plane turns with q
+    where the physics is nonlinear, so no least squares of SciPy is the whole search.
 
     Args:
         start: coordinates of physics alone.

@@ -23,7 +23,8 @@ from orthaug.physics.excitation import excitation
 from orthaug.physics.parameters import PhysicsMap, magnitude, tied_text
 
 CONTRADICTION = 0.05  # p-value below which θ̂ contradicts the physics, to match the 95 % intervals
-ITERATIONS = 200  # Levenberg-Marquardt steps from one start
+_EVALUATIONS = 1000  # from one start, at most: near a singular solution the search creeps
+_STEP = 1e-14  # relative to p, each in its size: a shorter one is rounding
 _ROUNDING = 1e-14  # smallest eigenvalue of a correlation matrix that is not rounding
 _SOLVED = {
     True: 1e-6,
@@ -111,44 +112,44 @@ class _Fit:
 
     @np.errstate(all="ignore")  # where there is no solution p goes to infinity
     def descend(self, p: Vector) -> tuple[float, Vector]:
-        """Return cost and p of the minimum that Levenberg-Marquardt finds from p.
+        """Return cost and p of the minimum that SciPy's dog-leg search finds from p.
 
-        Cost inf where θ has no value at p.
-
-        Every step solves its linear problem within the bounds exactly: p ends on a bound or away
-        from it.
+        Cost inf where θ has no value at p. The search goes from bound to bound, so p ends on one or
+        away from it.
         """
-        from scipy.optimize import lsq_linear  # slow to import
+        from scipy.optimize import least_squares  # slow to import
 
-        free = list(self.free)
+        cost, free = _cost(*self.at(p)), list(self.free)
+        if not free or not np.isfinite(cost):
+            return cost, p
+        scale = self.physics.size[free]
         low, high = (bound[free] for bound in self.physics.bounds)
-        residual, jacobian = self.at(p)
-        cost, damping = _cost(residual, jacobian), 0.0
-        for _ in range(ITERATIONS if free and np.isfinite(cost) else 0):
-            scale = self.physics.size[free]
-            columns = jacobian[:, free] * scale
-            rows = np.vstack([columns, np.diag(np.sqrt(damping) * np.linalg.norm(columns, axis=0))])
-            right = np.concatenate([-residual, np.zeros(len(free))])
-            limits = ((low - p[free]) / scale, (high - p[free]) / scale)
-            step = lsq_linear(rows, right, limits, method="bvls")
+
+        def rows(z: Vector) -> Vector:
+            residual, jacobian = self.at(moved(z))
+            return residual if np.isfinite(jacobian).all() else np.full_like(residual, np.inf)
+
+        def moved(z: Vector) -> Vector:
             new = p.copy()
-            moved = np.clip(p[free] + scale * step.x, low, high)
-            new[free] = np.where(
-                step.active_mask < 0, low, np.where(step.active_mask > 0, high, moved)
-            )
-            small = (
-                np.max(np.abs(new - p) / np.maximum(np.abs(p), 1e-3 * self.physics.size)) < 1e-11
-            )
-            at_new = self.at(new)
-            lower = _cost(*at_new)
-            if lower <= cost * (1 + 1e-9 * small):
-                p, cost, (residual, jacobian) = new, lower, at_new
-                damping = damping / 10 if damping > 1e-6 else 0.0
-            elif not small:
-                damping = max(10 * damping, 1e-3)
-            if small or damping > 1e12:
-                break
-        return cost, p
+            new[free] = np.clip(z * scale, low, high)
+            return new
+
+        end = least_squares(
+            rows,
+            np.clip(p[free] / scale, low / scale, high / scale),
+            lambda z: self.at(moved(z))[1][:, free] * scale,  # pyright: ignore[reportArgumentType]
+            bounds=(low / scale, high / scale),
+            method="dogbox",
+            xtol=_STEP,
+            ftol=None,  # pyright: ignore[reportArgumentType]
+            gtol=None,  # pyright: ignore[reportArgumentType]
+            max_nfev=_EVALUATIONS,
+        )
+        new = moved(end.x)
+        new[free] = np.where(
+            end.active_mask < 0, low, np.where(end.active_mask > 0, high, new[free])
+        )
+        return _cost(*self.at(new)), new
 
     def solutions(self, starts: int) -> list[Vector]:
         """Return the best p first, then others that explain θ̂ equally well.

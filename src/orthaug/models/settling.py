@@ -1,7 +1,8 @@
 """Initial states by least squares on the measured outputs, of many windows side by side.
 
-A damped Gauss-Newton iteration on every start by itself. Starts that a window does not show stay
-near the guess.
+A damped Gauss-Newton iteration on every start by itself: each window has its own damping and end,
+which the minimizer of training, with one for all unknowns, has not. Starts that a window does not
+show stay near the guess.
 """
 
 from __future__ import annotations

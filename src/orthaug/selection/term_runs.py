@@ -31,7 +31,7 @@ from orthaug.fitting.objective import (
     errors_of,
 )
 from orthaug.fitting.segments import Segments, build_segments
-from orthaug.fitting.solvers.descent import MARQUARDT
+from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.lagged import LaggedDynamics

@@ -1,4 +1,4 @@
-"""Solvers: frozen declarations that minimise a criterion over the learner's weights."""
+"""Solvers: frozen declarations that minimize a criterion over the learner's weights."""
 
 import lazy_loader
 

@@ -18,7 +18,7 @@ from orthaug._base.jax import Array, jax, jnp, training_clock
 from orthaug._base.progress import RunProgress, StopTraining, quiet
 from orthaug._base.registry import check_fields
 from orthaug.fitting.paper_criterion import PaperCriterion, Physics
-from orthaug.fitting.solvers.compiled import burst_length
+from orthaug.fitting.solvers.minimize import burst_length
 from orthaug.fitting.status import Ending
 from orthaug.models.rows import Chunk
 
@@ -72,7 +72,7 @@ class AdamLBFGS:
         """Return itself: the pipeline is run whole."""
         return self
 
-    def minimise(
+    def minimize(
         self,
         criterion: PaperCriterion,
         w: Float[Array, "nw"],

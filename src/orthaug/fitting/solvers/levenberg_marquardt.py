@@ -15,8 +15,9 @@ from orthaug._base.registry import LIBRARY_ONLY, SpecLimit, check_fields
 from orthaug.fitting.normal_equations import Normal
 from orthaug.fitting.solvers import compiled
 from orthaug.fitting.solvers.compiled import Settings, TrainingRun
-from orthaug.fitting.solvers.descent import Descent, SquaredResiduals, descend
+from orthaug.fitting.solvers.damped_step import IDENTITY
 from orthaug.fitting.solvers.limit import Limit, longest_of
+from orthaug.fitting.solvers.minimize import Descent, SquaredResiduals, minimize
 from orthaug.models.rows import Overlap
 
 _ITERATIONS = 300  # the default limit
@@ -68,9 +69,10 @@ class LevenbergMarquardt:
         return Limit(self.iterations, longest, noticeable)
 
     def _settings(self, noticeable: float = 0.0, **options: Any) -> Settings:
-        return Settings(self.limit(noticeable), self.tolerance, **options)
+        options = {"damping": IDENTITY} | options
+        return Settings(limit=self.limit(noticeable), tolerance=self.tolerance, **options)
 
-    def minimise(
+    def minimize(
         self,
         criterion: Callable[..., Normal],
         w: Float[Array, "nw"],
@@ -78,11 +80,13 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """Minimise `‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
+        """Minimize `‖r(w)‖² + α‖w‖²` from `w`, compiled whole: the rows are in memory.
 
-        See `compiled.minimise`.
+        See `compiled.minimize_compiled`.
         """
-        return compiled.minimise(criterion, w, arguments, overlap, self._settings(**options))
+        return compiled.minimize_compiled(
+            criterion, w, arguments, overlap, self._settings(**options)
+        )
 
     def drive(
         self,
@@ -91,8 +95,8 @@ class LevenbergMarquardt:
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
-        """Minimise the same pass by pass, for rows elsewhere; see `compiled.minimise_by_engine`."""
-        return compiled.minimise_by_engine(normal_at, w, overlap, self._settings(**options))
+        """Minimize the same pass by pass, for rows elsewhere; see `compiled.minimize_by_engine`."""
+        return compiled.minimize_by_engine(normal_at, w, overlap, self._settings(**options))
 
     def descend(
         self,
@@ -103,7 +107,7 @@ class LevenbergMarquardt:
         noticeable: float = 0.0,
         **options: Any,
     ) -> Descent:
-        """Minimise `‖r(p)‖² + α‖w‖²` from p, driven by the host; see `descent.descend`."""
-        return descend(
+        """Minimize `‖r(p)‖² + α‖w‖²` from p, driven by the host; see `minimize.minimize`."""
+        return minimize(
             objective, p, start, limit=self.limit(noticeable), tolerance=self.tolerance, **options
         )
