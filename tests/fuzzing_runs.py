@@ -182,16 +182,17 @@ def try_command(seed: int, folder: Path) -> str:
 
 def try_state(seed: int, folder: Path) -> str:
     """A state of training that was spoilt is dropped, and said; one that was not comes back as it was."""
+    import jax
+
     from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints
 
     rng = np.random.default_rng([500, seed])
     shutil.rmtree(folder / "kept", ignore_errors=True)
     checkpoints = Checkpoints(folder / "kept", "fuzz", every=0.0)
     kept = checkpoints.of_run("x", form=OF_DESCENT)
-    leaves = [rng.normal(size=rng.integers(1, 5)) for _ in range(13)]
-    state = OF_DESCENT._replace(
-        point=tuple(leaves[:5]), **dict(zip(OF_DESCENT._fields[1:], leaves[5:], strict=True))
-    )
+    form = jax.tree.structure(OF_DESCENT)
+    leaves = [rng.normal(size=rng.integers(1, 5)) for _ in range(form.num_leaves)]
+    state = jax.tree.unflatten(form, leaves)
     kept.keep(state)
     content = kept.path.read_bytes()
     kept.path.write_bytes(content if seed % 10 == 0 else mutated(content, rng))
@@ -201,7 +202,7 @@ def try_state(seed: int, folder: Path) -> str:
         found = kept.state()
         if found is None:
             return "refused" if checkpoints.spoilt and not same else "a sound state was dropped"
-        held = [*found.point, *found[1:]]
+        held = jax.tree.leaves(found)
         return (
             "equal"
             if same and all(map(np.array_equal, held, leaves))
