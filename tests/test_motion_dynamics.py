@@ -16,7 +16,7 @@ import orthaug.fitting.segments as laid
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.segments import build_segments, respond, sensitivity
 from orthaug.models.dynamics import AutodiffDynamics, Numbers
-from orthaug.models.learners import Bound
+from orthaug.models.learners import Bound, nothing_learned
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
 from orthaug.physics.integrators import inputs_at_points
@@ -82,7 +82,9 @@ def test_an_exact_step_is_that_of_the_matrix_exponential(hold: str) -> None:
     a, b = np.array([[0, 1], [-k / m, -c / m]]), np.array([[0], [1 / m]])
     data = record()
     u = data.experiments[0].inputs[:, 0]
-    ours = run(MotionDynamics(motion, (), None, TS, 1), numbers(motion), data, [0.3, -0.2])
+    ours = run(
+        MotionDynamics(motion, (), nothing_learned(), TS, 1), numbers(motion), data, [0.3, -0.2]
+    )
     if method == "zoh":
         ad, bd, *_ = scipy.signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), TS, "zoh")
         x = np.array([0.3, -0.2])
@@ -110,7 +112,12 @@ def test_a_nonlinear_motion_under_a_spline_is_that_of_an_adaptive_integrator(
     )
     time = TS * np.arange(80)
     data = oa.Record.from_arrays(u=np.sin(3 * time), y=np.zeros(80), sampling_time=TS)
-    ours = run(MotionDynamics(motion, (), None, TS, substeps), numbers(motion), data, [0.5, 0.0])
+    ours = run(
+        MotionDynamics(motion, (), nothing_learned(), TS, substeps),
+        numbers(motion),
+        data,
+        [0.5, 0.0],
+    )
 
     def rates(t, x):
         return [x[1], np.sin(3 * t) - 0.4 * x[1] - 4 * x[0] - 3 * x[0] ** 3]
@@ -196,7 +203,7 @@ def test_sensitivities_of_steps_at_once_are_those_step_by_step(
 
 def test_a_start_is_guessed_and_then_settled() -> None:
     motion = spring()
-    form, made = MotionDynamics(motion, (), None, TS, 1), numbers(motion)
+    form, made = MotionDynamics(motion, (), nothing_learned(), TS, 1), numbers(motion)
     data = record(64)
     truth = run(form, made, data, [0.4, -1.0])
     guessed = guess(motion, truth[:, :1], [0, 30], TS)
@@ -215,7 +222,7 @@ def test_a_start_that_no_row_shows_stays_where_it_was_guessed() -> None:
         inputs=["u"],
         parameters=[oa.PhysicalParameter("a", 1.0)],
     )
-    form, data = MotionDynamics(motion, (), None, TS, 1), record(20)
+    form, data = MotionDynamics(motion, (), nothing_learned(), TS, 1), record(20)
     made = numbers(motion)
     inputs, outputs = form.inputs(data.experiments[0], data), data.experiments[0].outputs
     windows = Windows(inputs[..., None], outputs[..., None], np.ones((20, 1), dtype=bool))
