@@ -228,7 +228,7 @@ def _lagged_budget(
     measure: Measure | None,
 ) -> Budget | None:
     """Return `bias_budget` of a fit of difference equations."""
-    if not fit.status.ok or fit.model.structure != "orthogonal":
+    if not fit.status.ok or fit.model.structure != "orthogonal" or not fit.learns:
         return None
     measure = Training() if measure is None else measure
     name = "training" if fit.measure is None else fit.measure.name

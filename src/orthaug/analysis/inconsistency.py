@@ -28,8 +28,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug.fitting.estimates import Estimate
 from orthaug.inference.covariance import by_experiment, newey_west
-from orthaug.inference.influence import LARGEST, Influence, one_step_slopes, prior_of
+from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
+from orthaug.models.statistics import prior_of
 from orthaug.physics.streamed import StreamedProblem
 
 LEVEL = 0.03  # of the test; benchmarks/coverage_noise.py has its false alarms
@@ -214,10 +215,11 @@ def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
         return None
     if rows < _FEWEST or rows * len(problem.outputs) * len(plain.gram) > LARGEST:
         return None
-    errors = np.concatenate([(t.measured - t.model)[t.start :] for t in one_step.trajectories])  # type: ignore[operator]
+    errors = one_step.errors
     if len(errors) != rows:
         return None
-    slopes, prior = one_step_slopes(problem, model), prior_of(plain, len(fit.theta))
+    slopes = one_step_slopes(problem, model)
+    prior = prior_of(plain.gram, plain.ridge, len(fit.theta))
     if not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return None
     k = np.column_stack([np.eye(len(fit.theta)), fit._slope()])

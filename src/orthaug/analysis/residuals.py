@@ -210,7 +210,7 @@ def _channels(
 
 def errors_of(response: Response, skip: int = 0) -> list[Matrix]:
     """Return measured less model of each experiment, on rows with a value, after `skip` of them."""
-    return [(t.measured - t.model)[t.start :][skip:] for t in response.trajectories]  # type: ignore[operator]
+    return [trajectory.errors[skip:] for trajectory in response.trajectories]
 
 
 def rms_errors(response: Response, skip: int = 0) -> Vector:

@@ -66,7 +66,6 @@ def check(
     """Report excitation and identifiability; trains nothing."""
     from orthaug.commands.folder import check_figure, save_figure
     from orthaug.commands.job_result import check as check_job
-    from orthaug.commands.job_result import refusal
     from orthaug.commands.opening import open_job
     from orthaug.reports.text import check_text
 
@@ -80,7 +79,7 @@ def check(
         from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
-    refused = refusal(job, result)
+    refused = job.physics.refusal(job, result)
     if refused is not None:
         raise type(refused)(f"{spec}: {refused}")
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.attempt import attempt
 from orthaug.commands.job import Job
@@ -45,11 +44,6 @@ def check(job: Job) -> CheckResult:
             "warnings": [*job.warnings, *warnings, *closed_loop(job.train.record)],
         }
     )
-
-
-def refusal(job: Job, result: CheckResult) -> InputError | None:
-    """Return the reason why the job cannot be fitted, after the report; None where it can."""
-    return job.physics.refusal(job, result)
 
 
 def content(

@@ -135,9 +135,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
         phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
         phi = phi / unit[:, None]
         basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
-        runs = fit.model.predict(problem.record).trajectories
-        errors = [(run.measured - run.model)[problem.rows.start :] for run in runs]  # type: ignore[operator]
-        whole = (np.concatenate(errors)[rows] / unit).ravel()
+        whole = (fit.model.predict(problem.record).errors[rows] / unit).ravel()
         error = whole - basis @ (basis.T @ whole)
         constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
 
@@ -309,7 +307,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
             return None, []
         held = tuple(fit.at_bound) if fit else ()
         found = imitation(problem, self.map, others=fit is None, held=held)
-        if fit is not None and not fit.status.ok:
+        if fit is not None and not (fit.status.ok and fit.learns):
             return found, []
         seen = [str(entry) for entry in problem.features.entries]
         return found, shared_warnings(problem.shared, seen)
@@ -393,7 +391,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
         """Return the bias that what the learner found implies, under the spec's measure."""
         from orthaug.analysis.budget import budget_on
 
-        if fit.model.structure != "orthogonal":
+        if fit.model.structure != "orthogonal" or not fit.learns:
             return None
         terms = self._terms(job, fit)
         return budget_on(terms, declare_suspects(job.spec.suspects, terms.problem))

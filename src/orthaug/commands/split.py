@@ -25,7 +25,7 @@ from orthaug.commands.run import (
 )
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
-from orthaug.fitting.estimates import STD_KINDS, WITHHELD
+from orthaug.fitting.any_fit import STD_KINDS, WITHHELD
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.model import Model

@@ -11,12 +11,19 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import fold
-from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout, lag_rows
+from orthaug.fitting.any_fit import (
+    STD_KINDS,
+    WITHHELD,
+    AnyFit,
+    Restart,
+    left_out,
+    parameter_frame,
+    parameter_lines,
+)
 from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion, Prediction, Simulation
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import (
@@ -26,8 +33,8 @@ from orthaug.inference.covariance import (
     robust_split_covariance,
     row_influence,
 )
-from orthaug.inference.influence import hc3, one_step_slopes, prior_of
-from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
+from orthaug.inference.influence import hc3, one_step_slopes
+from orthaug.inference.learned_terms import learned_terms, term_lines
 from orthaug.inference.measures import (
     OF_ROWS,
     Measure,
@@ -38,9 +45,6 @@ from orthaug.inference.measures import (
 )
 from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.over_experiments import (
-    FEWEST,
-    OverExperiments,
-    over_experiments,
     split_without_each,
 )
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
@@ -51,7 +55,7 @@ from orthaug.inference.splitting import (
     streamed_slope,
 )
 from orthaug.models.model import Model
-from orthaug.models.statistics import Statistics, half_inverse
+from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.output_weights import times
@@ -64,147 +68,6 @@ if TYPE_CHECKING:
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
-STD_KINDS = {
-    "plain": "for white errors of constant variance",
-    "hc3": "robust (HC3), because the variance of the errors is not constant",
-    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
-    "batch-means": "robust (batch means), because the errors of the free run are coloured",
-    "autoregressive": (
-        "robust (autoregressive errors), because the errors of the free run are coloured"
-    ),
-    "batch-means-uneven": (
-        "robust (batch means), because the variance of the free run's errors is not constant"
-    ),
-    "none": "none: the errors of the free run are correlated over too many steps",
-    "chosen": "none: the terms were chosen on the rows that were fitted",
-}
-"""How standard errors were made, in words."""
-WITHHELD = ("none", "chosen")
-"""The kinds of fits that have none."""
-
-
-@dataclass(frozen=True)
-class Restart:
-    """One run from its own initial weights."""
-
-    seed: int
-    loss: float | None
-    iterations: int
-    code: str
-    chosen: bool
-    regularization: str | float = "none"
-    validation: float | None = None
-    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks.
-    """
-    score: float | None = None
-    """Generalised cross-validation, where that chose among the runs."""
-
-
-class AnyFit(FitView):
-    """Methods common to fits of lagged models and of motions."""
-
-    model: Any
-    problem: Any
-    covariance: Matrix | None
-    freedom: float
-    scores: FreeRunScores | None
-    warnings: tuple[Warning, ...]
-
-    @property
-    def theta(self) -> Vector:
-        """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
-        return self.model.theta
-
-    @property
-    def learns(self) -> bool:
-        """False where the physics is alone."""
-        return self.model.learns
-
-    @cached_property
-    def terms(self) -> pd.DataFrame:
-        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
-
-        Else empty.
-        """
-        return term_frame(learned_terms(self.model))
-
-    def equation(self, writing: str = "text") -> str:
-        """Return the fitted equations with their numbers, where the learner is a sum of terms.
-
-        As "text", "latex", "python".
-
-        Raises:
-            InputError: another learner, physics that are Python functions, another writing.
-        """
-        return equation(self.model, writing)
-
-    @cached_property
-    def over_experiments(self) -> OverExperiments | None:
-        """Errors of θ̂ for experiments like those fitted, by leaving out one after the other.
-
-        Those of `std` and `interval` hold for the inputs that were applied. None where there are
-        fewer than three experiments, or no standard errors.
-        """
-        if self.covariance is None or self.model.numbers.tilt is not None:
-            return None
-        if self.problem.record.recordings[-1] + 1 < FEWEST:
-            return None
-        changes = self._changes_without_each()
-        return None if changes is None else self._over_experiments(changes)
-
-    def _changes_without_each(self) -> Matrix | None:
-        """Return the changes of θ̂ (E, nθ) where each experiment is left out, to first order."""
-        raise NotImplementedError
-
-    def _over_experiments(self, changes: Matrix) -> OverExperiments:
-        return over_experiments(changes, np.asarray(self.covariance), self.freedom, self.theta)
-
-    def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return the derivative of θ by (c, w), and which entries of these move."""
-        raise NotImplementedError
-
-    def _changes_of_free_run(self, free_run: Simulation) -> Matrix | None:
-        """Return what leaving an experiment out of the training on the free run changes (E, nθ).
-
-        The points of the split stay.
-        """
-        statistics, moves = self.model.statistics, self.moves_by()
-        if self.scores is None or statistics.gram is None or moves is None:
-            return None
-        scores = self.scores.by_recording(self.problem.record, free_run.washout)
-        if scores is None:
-            return None
-        k, free = moves
-        information = statistics.gram + np.diag(prior_of(statistics, len(self.theta)))
-        half = half_inverse(information[np.ix_(free, free)], int(free[: len(self.theta)].sum()))
-        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * _left_out(len(scores))
-
-    def withheld(self, kind: str, why: Warning) -> Any:
-        """Return the fit without standard errors and intervals of θ, terms and predictions.
-
-        A warning says why.
-        """
-        fit: Any = self
-        statistics = replace(fit.model.statistics, middle=None)
-        return replace(
-            fit,
-            model=replace(fit.model, statistics=statistics),
-            covariance=None,
-            plain_covariance=None,
-            std_kind=kind,
-            warnings=(*fit.warnings, why),
-        )
-
-    def lines(self) -> list[str]:
-        """Return the lines of `summary` before its warnings."""
-        raise NotImplementedError
-
-    def summary(self) -> str:
-        """Return a page of text: status, parameters with their uncertainty, warnings."""
-        warnings = (
-            ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
-        )
-        return "\n".join(fold([*self.lines(), *warnings]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,10 +267,7 @@ class Estimate(AnyFit):
             return replace(self._robust_free_run(lags, kind), std_kind=kind)
         if kind == "hc3":
             return self._hc3()
-        trajectories = self.model.predict(self.problem.record).trajectories
-        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
-        starts = [t.start for t in trajectories]
-        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
+        residual = self.model.predict(self.problem.record).errors
         used = (self.problem, residual, self.effective_weights, lags)
         if self.measure is None and self.model.shared is None:
             covariance = robust_covariance(*used)
@@ -429,10 +289,7 @@ class Estimate(AnyFit):
             raise InputError(
                 "the fit has no statistics for robust standard errors; fit the data again."
             )
-        trajectories = self.model.predict(self.problem.record).trajectories
-        errors = [t.measured - t.model for t in trajectories]  # type: ignore[operator]
-        starts = [t.start for t in trajectories]
-        residual = np.concatenate([e[s:] for e, s in zip(errors, starts, strict=True)])
+        residual = self.model.predict(self.problem.record).errors
         slopes, share = (
             one_step_slopes(self.problem, self.model),
             self.problem.count / len(self.problem.rows),
@@ -541,13 +398,12 @@ class Estimate(AnyFit):
         if self.model.statistics.gram is None:
             return None
         problem = self.problem
-        trajectories = self.model.predict(problem.record).trajectories
-        errors = np.concatenate([(t.measured - t.model)[t.start :] for t in trajectories])  # type: ignore[operator]
+        errors = self.model.predict(problem.record).errors
         matrix = problem.weight.matrix
         influence = row_influence(problem, self.model, self._slope())
         rows = np.einsum("kto,ko->kt", influence, errors @ (matrix.T @ matrix))
         found = np.stack([rows[owner == e].sum(axis=0) for e in range(experiments)])
-        return -found * _left_out(experiments)
+        return -found * left_out(experiments)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """Return the physical parameters of θ̂, with intervals by the delta method."""
@@ -612,11 +468,6 @@ class Estimate(AnyFit):
         return [*lines, *term_lines(learned_terms(self.model))]
 
 
-def _left_out(experiments: int) -> float:
-    """Return by how much more θ̂ changes where an experiment is left out than by its own score."""
-    return experiments / (experiments - 1)
-
-
 def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
     """Return the places among `names` of the θ that the physics gives.
 
@@ -632,47 +483,3 @@ def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) ->
             f"the physics gives {', '.join(missing)}, which the baseline does not have."
         )
     return [names.index(name) for name in physics.theta_names]
-
-
-def parameter_frame(
-    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
-) -> pd.DataFrame:
-    """Return a table with a row per parameter: unit, initial, value, std, 95 % interval.
-
-    NaN where there is none.
-    """
-    import pandas as pd
-
-    nothing = np.full(len(parameters), np.nan)
-    ci = np.stack([nothing, nothing], axis=-1) if ci is None else ci
-    return pd.DataFrame(
-        {
-            "unit": [p.unit for p in parameters],
-            "initial": [p.initial for p in parameters],
-            "value": values,
-            "std": nothing if std is None else std,
-            "ci95_low": ci[:, 0],
-            "ci95_high": ci[:, 1],
-        },
-        index=pd.Index([p.name for p in parameters], name="parameter"),
-    )
-
-
-def parameter_lines(
-    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
-) -> list[str]:
-    """Return the parameters as lines of text, a heading first; a dash for no interval."""
-    width = max([9, *(len(p.name) for p in parameters)])
-    lines = [
-        f"{'parameter':<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  "
-        f"{'initial':>11}  unit"
-    ]
-    for i, parameter in enumerate(parameters):
-        spread, reach = f"{'–':>11}", f"{'–':^29}"
-        if std is not None and ci is not None and np.isfinite(std[i]):
-            spread, reach = f"{std[i]:11.4g}", f"[{ci[i, 0]:13.7g}, {ci[i, 1]:13.7g}]"
-        lines.append(
-            f"{parameter.name:<{width}}  {values[i]:14.8g}  {spread}  {reach}  "
-            f"{parameter.initial:11.5g}  {parameter.unit}".rstrip()
-        )
-    return lines

@@ -160,7 +160,7 @@ def _is_coloured(fit: Any) -> bool:
     And by more than a little.
     """
     for trajectory in fit.model.predict(fit.problem.record).trajectories:
-        errors = (trajectory.measured - trajectory.model)[trajectory.start :]
+        errors = trajectory.errors
         limit = max(_COLOURED, _SIGNIFICANT / math.sqrt(len(errors)))
         for own in (errors - errors.mean(axis=0)).T:
             found = autocorrelation(own[None])

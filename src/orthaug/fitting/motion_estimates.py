@@ -13,9 +13,7 @@ from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
-from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.estimates import (
+from orthaug.fitting.any_fit import (
     STD_KINDS,
     WITHHELD,
     AnyFit,
@@ -23,6 +21,8 @@ from orthaug.fitting.estimates import (
     parameter_frame,
     parameter_lines,
 )
+from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status

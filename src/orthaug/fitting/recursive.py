@@ -29,7 +29,8 @@ from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
-from orthaug.fitting.estimates import Estimate, order_of, parameter_frame, parameter_lines
+from orthaug.fitting.any_fit import parameter_frame, parameter_lines
+from orthaug.fitting.estimates import Estimate, order_of
 from orthaug.fitting.recursion import EstimateHistory, covariances
 from orthaug.fitting.recursive_rows import (
     RegressorStream,

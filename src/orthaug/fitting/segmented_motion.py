@@ -215,25 +215,33 @@ class SegmentedMotion(SegmentedProblem):
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
         return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
 
+    @property
+    def _washout(self) -> int:
+        """Leading steps of a segment that are not scored."""
+        return min(self.free_run.washout, self.segments.steps - 1)
+
+    @property
+    def _begins(self) -> list[list[int]]:
+        """The first rows of the segments of every experiment."""
+        steps, washout = self.segments.steps, self._washout
+        return [begins_of(len(one), steps, washout) for one in self.record.experiments]
+
     def recording_of_points(self) -> Int[np.ndarray, "N"]:
         """Return the number of the recording of each point of `trajectory`."""
-        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
-        counts = scored.reshape(-1, steps).sum(axis=1)
-        pieces = [len(begins_of(len(e), steps, washout)) for e in self.record.experiments]
-        segments = np.repeat(self.record.recordings, pieces)
+        counts = scored.reshape(-1, self.segments.steps).sum(axis=1)
+        segments = np.repeat(self.record.recordings, [len(begins) for begins in self._begins])
         return np.repeat(segments, counts[: len(segments)])
 
     def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
         """Return the states (N, nx) of every experiment, joined from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
-        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
-        for experiment in self.record.experiments:
+        for experiment, begins in zip(self.record.experiments, self._begins, strict=True):
             own = np.zeros((len(experiment), self.dynamics.states))
-            for begin in begins_of(len(experiment), steps, washout):
-                first = begin + (washout if begin else 0)
-                last = min(begin + steps, len(experiment))
+            for begin in begins:
+                first = begin + (self._washout if begin else 0)
+                last = min(begin + self.segments.steps, len(experiment))
                 own[first:last] = rows[place][first - begin : last - begin]
                 place += 1
             found.append(own)
@@ -241,11 +249,7 @@ class SegmentedMotion(SegmentedProblem):
 
     def with_starts(self, rows: list[Matrix]) -> SegmentedMotion:
         """Return the problem with segments that start at given states (N, nx) of all rows."""
-        steps, washout = self.segments.steps, min(self.free_run.washout, self.segments.steps - 1)
-        starts = []
-        for experiment, own in zip(self.record.experiments, rows, strict=True):
-            starts.append(own[begins_of(len(experiment), steps, washout)])
-        flat = np.concatenate(starts)
+        flat = np.concatenate([own[b] for own, b in zip(rows, self._begins, strict=True)])
         k, n0, m = np.asarray(self.segments.start).shape
         padded = np.concatenate([flat, np.zeros((k * m - len(flat), n0))])
         padded = np.where(np.isfinite(padded), padded, 0.0)

@@ -17,8 +17,8 @@ from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
+from orthaug.fitting.any_fit import Restart
 from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,

@@ -156,9 +156,7 @@ def joint_covariance(
     check_choice(convention, CONVENTIONS, "`convention`")
     if model.numbers.tilt is not None:
         raise InputError("an ensemble has no gradient in its weights; use a single learner.")
-    residual = np.concatenate(
-        [(t.measured - t.model)[t.start :] for t in model.predict(problem.record).trajectories]
-    )
+    residual = model.predict(problem.record).errors
     noise: Any = (
         residual.T @ residual / len(residual) if convention == "paper" else model.statistics.noise
     )
@@ -339,8 +337,7 @@ def row_influence(problem: Problem, model: Model, slope: Matrix) -> Float[np.nda
         raise InputError(
             "the fit has no statistics for robust standard errors; fit the data again."
         )
-    prior = np.concatenate([np.zeros(nt), np.full(len(statistics.gram) - nt, statistics.ridge)])
-    half = half_inverse(statistics.gram + np.diag(prior), nt)
+    half = half_inverse(statistics.information(nt), nt)
     root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
     rows = len(problem.rows)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(rows), repeat=True))

@@ -61,7 +61,7 @@ class Influence:
             nt: how many of the n unknowns are θ.
         """
         assert statistics.gram is not None
-        root = half_inverse(statistics.gram + np.diag(prior_of(statistics, nt)), nt)
+        root = half_inverse(statistics.information(nt), nt)
         rows, own = slopes @ root, slopes[..., :nt] @ half_inverse(statistics.gram[:nt, :nt], nt)
         used, count = (
             max(float(np.sum(rows**2) - np.sum(own**2)), 0.0),
@@ -135,12 +135,6 @@ def one_step_slopes(problem: Problem, model: Model, x: Matrix | None = None) -> 
     )
     slopes = moved.reshape(len(x), len(unit), ny) / unit[:, None]
     return np.einsum("oi,kni->kon", problem.weight.matrix, slopes)
-
-
-def prior_of(statistics: Statistics, nt: int) -> Vector:
-    """Return the precisions (n,) that the prior adds to M: 0 for θ, the ridge for weights."""
-    assert statistics.gram is not None
-    return np.concatenate([np.zeros(nt), statistics.ridge * np.ones(len(statistics.gram) - nt)])
 
 
 def hc3(

@@ -71,12 +71,11 @@ def differing_warning(
     """Return the warning that parameters differ between experiments; None where none does."""
     if not found.larger:
         return None
+    worst = sorted(found.larger, key=lambda i: -found.ratio[i])
+    shown, more, i = worst[:_LISTED], len(worst) - _LISTED, worst[0]
     listed = ", ".join(
-        f"{names[i]} by {found.ratio[i]:.2g} times its standard error"
-        for i in found.larger[:_LISTED]
+        f"{names[j]} by {found.ratio[j]:.2g} times its standard error" for j in shown
     )
-    more = len(found.larger) - _LISTED
-    i = found.larger[0]
     low, high = found.interval[i]
     text = (
         f"parameters differ between the {found.experiments} experiments by more than `ci95` "

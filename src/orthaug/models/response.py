@@ -120,6 +120,12 @@ class Trajectory:
         return self.baseline + self.learner if self.whole is None else self.whole
 
     @property
+    def errors(self) -> Matrix:
+        """Measured less model on the rows with a value (N − start, ny)."""
+        assert self.measured is not None, "of a record with measured outputs"
+        return (self.measured - self.model)[self.start :]
+
+    @property
     def baseline_before(self) -> Matrix:
         """φ(θ − θ_aux), the baseline that belongs to `learner_before`."""
         return self.model - self.learner_before
@@ -141,6 +147,11 @@ class Response:
     def model(self) -> Matrix:
         """The model's output (N, ny), experiments one after another."""
         return np.concatenate([t.model for t in self.trajectories])
+
+    @property
+    def errors(self) -> Matrix:
+        """Measured less model on the rows with a value, experiments one after another."""
+        return np.concatenate([t.errors for t in self.trajectories])
 
     def __repr__(self) -> str:
         kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"

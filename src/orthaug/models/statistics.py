@@ -23,6 +23,11 @@ def column_units(gram: Matrix, nt: int) -> Vector:
     return 1 / np.where(size > 1e-150, size, 1.0)
 
 
+def prior_of(gram: Matrix, ridge: float | Vector, nt: int) -> Vector:
+    """Return the precisions (n,) that the prior adds to M: 0 for θ, the ridge for weights."""
+    return np.concatenate([np.zeros(nt), ridge * np.ones(len(gram) - nt)])
+
+
 def half_inverse(gram: Matrix, nt: int, *, own_units: bool = False) -> Float[np.ndarray, "n r"]:
     """Return H, with `H Hᵀ` the inverse of a Gram matrix on the directions that the data see.
 
@@ -65,8 +70,7 @@ class JointCovariance:
 
         Variances are then sums of squares, which no rounding makes negative.
         """
-        nw = len(self.gram) - self.nt
-        prior = np.concatenate([np.zeros(self.nt), self.ridge * np.ones(nw)])
+        prior = prior_of(self.gram, self.ridge, self.nt)
         half = half_inverse(self.gram + np.diag(prior), self.nt)
         variance = float(np.trace(self.middle) / max(np.trace(self.gram), 1e-300))
         values, vectors = np.linalg.eigh(half.T @ (self.middle + variance * np.diag(prior)) @ half)
@@ -102,6 +106,11 @@ class Statistics:
     nobody tuned it.
     """
     sensor: Matrix | None = None
+
+    def information(self, nt: int) -> Matrix:
+        """Return M, the Gram matrix with the precisions of the weights' prior."""
+        assert self.gram is not None
+        return self.gram + np.diag(prior_of(self.gram, self.ridge, nt))
 
     def joint(self, nt: int) -> JointCovariance | None:
         """Return Cov(c, w), the nt entries of θ first."""

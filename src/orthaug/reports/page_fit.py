@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.fitting.estimates import STD_KINDS
+from orthaug.fitting.any_fit import STD_KINDS
 from orthaug.models.response import Response
 from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart

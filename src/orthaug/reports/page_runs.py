@@ -127,9 +127,7 @@ def error_band(response: Response) -> dict[str, tuple[float, float]]:
     if any(t.measured is None or t.diverged for t in response.trajectories):
         return found
     for i, channel in enumerate(response.outputs):
-        errors = np.concatenate(
-            [(t.measured - t.model)[t.start :, i] for t in response.trajectories]
-        )  # type: ignore
+        errors = response.errors[:, i]
         errors = errors[np.isfinite(errors)]
         if len(errors) >= 40:
             found[channel.name] = tuple(

@@ -322,7 +322,7 @@ class FitResult(ResultHeader):
     parameters: list[ParameterResult]
     standard_errors: str | None
     standard_errors_by: str | None = None
-    """Kind of the standard errors, a key of `fitting.estimates.STD_KINDS`; None for white noise.
+    """Kind of the standard errors, a key of `fitting.any_fit.STD_KINDS`; None for white noise.
     """
     physical_parameters: list[ParameterResult] | None
     over_experiments: OverExperimentsResult | None = None

@@ -22,7 +22,6 @@ from orthaug._base.errors import InputError
 from orthaug.commands import init as starting
 from orthaug.commands.job import Job
 from orthaug.commands.job_result import check as check_job
-from orthaug.commands.job_result import refusal
 from orthaug.commands.opening import open_job
 from orthaug.data.columns import Column
 from orthaug.data.record import Channel, check_step
@@ -181,7 +180,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
 
             use_compilation_cache()
         result = check_job(job)
-        refused = refusal(job, result)
+        refused = job.physics.refusal(job, result)
         bias = [
             {"name": one.name, "removed_by": one.removed_by, "percent": one.percent}
             for one in result.bias or ()
