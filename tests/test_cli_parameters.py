@@ -789,7 +789,7 @@ def test_the_sampling_time_need_not_be_declared(project):
     np.testing.assert_allclose(timed.initial, declared.problem.baseline.initial, rtol=1e-9)
     thinned = text.replace('["run.csv"]', '["run.csv"], every = 2')
     project.write_text(thinned)
-    assert load_spec(project).physics.constants == (("Ts", 0.02),)
+    assert load_spec(project).physics.map.constants == (("Ts", 0.02),)
     project.write_text(thinned + "[baseline.constants]\nTs = 0.01\n")
     done = run("check", project)
     assert done.code == 2 and one_line(
