@@ -31,7 +31,6 @@ from orthaug.inference.measures import (
     weigh_problem,
 )
 from orthaug.physics.excitation import excitation, require_rank
-from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen_columns, shared_directions
@@ -211,7 +210,7 @@ class LaggedTerms:
         return [*_by_inputs(self, cause, biased), *_by_measure(self, cause, biased)]
 
     def _weigh(self, rows: Matrix) -> Matrix:
-        return times(self.weighed.unit, np.asarray(rows))
+        return self.weighed.times(np.asarray(rows))
 
     def _sampled(self, suspect: Suspect) -> Suspect:
         return suspect.sampled(self.problem.record.sampling_time)

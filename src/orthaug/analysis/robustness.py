@@ -11,9 +11,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
-from orthaug.analysis.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
 from orthaug.physics.streamed import StreamedProblem

@@ -58,7 +58,6 @@ from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
-from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
@@ -363,7 +362,7 @@ class Estimate(AnyFit):
             return streamed_slope(self.model, problem)
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
-        return learner_slope(self.model, points, problem.projection, unit)
+        return learner_slope(self.model, points, problem.projection, unit, problem.noise)
 
     def _changes_without_each(self) -> Matrix | None:
         problem, split = self.problem, self.measure
@@ -386,7 +385,7 @@ class Estimate(AnyFit):
         if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
             return changes
         weighed = weigh_problem(measure, problem)
-        values = times(weighed.unit, self.model.learner_at(weighed.points.x))
+        values = weighed.times(self.model.learner_at(weighed.points.x))
         every = np.tile(owner, len(values) // len(owner))
         found = split_without_each(
             weighed.projection, self.model.shared, values, every, experiments

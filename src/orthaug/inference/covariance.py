@@ -171,6 +171,7 @@ def joint_covariance(
         problem.rows.x,
         problem.projection.q,
         problem.weight.matrix,
+        problem.noise,
     )
     whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
@@ -342,7 +343,10 @@ def row_influence(problem: Problem, model: Model, slope: Matrix) -> Float[np.nda
     rows = len(problem.rows)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(rows), repeat=True))
     moved = np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root)))
-    return from_chunks(moved, rows).reshape(rows, nt, ny)
+    found = from_chunks(moved, rows).reshape(rows, nt, ny)
+    if problem.noise is None:
+        return found
+    return np.swapaxes(problem.noise.rows(np.swapaxes(found, 1, 2)), 1, 2)
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:

@@ -24,6 +24,7 @@ from orthaug.models.response import Response, Trajectory
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import Memory, checked_row, one_experiment, step_lagged
 from orthaug.physics.baseline import Parameter
+from orthaug.physics.noise import NoiseModel
 
 _BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
@@ -51,13 +52,20 @@ def _last_outputs(
     numbers: Numbers,
     states: Float[Array, "m n0"],
     inputs: Float[Array, "m T nu"],
+    added: Float[Array, "m T ny"] | None,
     horizon: Any,
 ) -> Parts:
-    """Return the last of `horizon` free-run steps from each of m starts."""
+    """Return the last of `horizon` free-run steps from each of m starts.
+
+    What is `added` to an output is in the past of the steps after it.
+    """
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
     def step(i: Any, carry: tuple[Any, Parts]) -> tuple[Any, Parts]:
-        return side_by_side(carry[0], inputs[:, i])
+        following, parts = side_by_side(carry[0], inputs[:, i])
+        if added is not None:
+            following = following.at[:, : len(form.outputs)].add(added[:, i])
+        return following, parts
 
     nothing = jnp.zeros((states.shape[0], len(form.outputs)))
     return jax.lax.fori_loop(0, horizon, step, (states, Parts(nothing, nothing, nothing)))[1]
@@ -99,6 +107,8 @@ class Model(RecordModel, NotebookView):
     """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
+    noise: NoiseModel | None = field(default=None, kw_only=True)
+    """The model of the errors' colour, for predictions; None for white errors."""
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
 
@@ -152,6 +162,9 @@ class Model(RecordModel, NotebookView):
     def predict(self, record: Record, horizon: int = 1) -> Response:
         """Predict each row from outputs measured up to `horizon` samples before it.
 
+        With a noise model the measured errors before it say what those on the way are likely to
+        be: then the response is the sum of physics, learner and that forecast.
+
         Args:
             record: inputs and outputs, measured.
             horizon: samples ahead, 1 or more.
@@ -169,7 +182,12 @@ class Model(RecordModel, NotebookView):
                 parts = self.parts_at(self.form.regressors(experiment, record, first))
             else:
                 parts = self._predict_ahead(experiment, record, horizon)
-            trajectories.append(trajectory(parts, experiment, experiment.outputs, first))
+            found = trajectory(parts, experiment, experiment.outputs, first)
+            if self.noise is not None:
+                forecast = self._forecast(experiment, record, horizon)[:, -1]
+                found = replace(found, whole=found.model.copy())
+                found.model[first:] += forecast
+            trajectories.append(found)
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 
     def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
@@ -293,13 +311,25 @@ class Model(RecordModel, NotebookView):
         inputs = self.form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
+        arrays: tuple[np.ndarray, ...] = (states, windows)
+        if self.noise is not None:
+            arrays = (*arrays, self._forecast(experiment, record, horizon))
         # Windows overlap: they are copied batch by batch
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
         return _in_batches(
-            lambda s, u: _last_outputs(self.form, self.numbers, s, u, horizon),
-            (states, windows),
+            lambda s, u, added=None: _last_outputs(self.form, self.numbers, s, u, added, horizon),
+            arrays,
             largest,
         )
+
+    def _forecast(
+        self, experiment: Experiment, record: Record, horizon: int
+    ) -> Float[np.ndarray, "m h ny"]:
+        """Return the noise model's forecasts on the way to every row that is predicted."""
+        assert self.noise is not None
+        measured = experiment.outputs[self.form.first_row :]
+        errors = measured - self.parts_at(self.form.regressors(experiment, record)).total
+        return self.noise.forecast_ahead(errors, horizon)
 
     def first_state(self, experiment: Experiment, record: Record) -> Vector:
         """Return the state at the first row of the free run from the measured outputs."""
