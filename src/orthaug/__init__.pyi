@@ -36,6 +36,7 @@ from .data.preparation import Lowpass as Lowpass
 from .data.steps import Shift as Shift
 from .export import export as export
 from .export import numpy_step as numpy_step
+from .fitting import ARMA as ARMA
 from .fitting import Additive as Additive
 from .fitting import Auto as Auto
 from .fitting import Estimate as Estimate

@@ -31,6 +31,7 @@ from orthaug.inference.measures import (
     weigh_problem,
 )
 from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.shared import seen_columns, shared_directions
@@ -201,7 +202,8 @@ class LaggedTerms:
         if fit is None or fit.model.statistics.noise is None:
             return 0.0
         rows = np.ones((len(own), 1)) * np.sqrt(np.diag(fit.model.statistics.noise))
-        noise = np.sum(self._weigh(rows) ** 2) / own.shape[1]
+        # innovations: no filter of a noise model
+        noise = np.sum(times(self.weighed.unit, rows) ** 2) / own.shape[1]
         taken = fit.effective_weights / self.problem.count * noise
         return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 

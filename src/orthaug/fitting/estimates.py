@@ -25,6 +25,7 @@ from orthaug.fitting.any_fit import (
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
+from orthaug.fitting.output_noise import OutputNoise, noise_of
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import (
     interval,
@@ -163,6 +164,11 @@ class Estimate(AnyFit):
             self.problem.baseline.parameters, self.theta, self.std, self.interval
         )
 
+    @cached_property
+    def noise(self) -> tuple[OutputNoise, ...]:
+        """The noise model of each output; empty where nobody asked for one."""
+        return noise_of(self.model, self.problem)
+
     def split(self, measure: Measure) -> Estimate:
         """Return the same function with θ, components and intervals under a measure (F2).
 
@@ -229,6 +235,11 @@ class Estimate(AnyFit):
             self.model.statistics.gram is None and self.model.numbers.tilt is None
         ):
             raise InputError("the joint covariance needs a one-step fit with its own statistics.")
+        if self.model.coloured:
+            raise InputError(
+                "the joint covariance of θ̂ and weights is for white noise; `covariance` is that of "
+                "θ̂ with the noise model."
+            )
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
@@ -250,6 +261,11 @@ class Estimate(AnyFit):
             InputError: a fit without standard errors or with a parameter at a bound; errors that
                 remember each other for too long; a kind that is not for this criterion.
         """
+        if self.model.coloured:
+            raise InputError(
+                "robust standard errors are for fits without a noise model; its own are those of "
+                "white innovations."
+            )
         simulates = self.criterion.free_run is not None
         kinds = (
             ("batch-means", "batch-means-uneven", "autoregressive")
@@ -463,6 +479,8 @@ class Estimate(AnyFit):
             lines.append(f"one step    Φ⁺Y would give {moved}")
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
+        if self.model.noise is not None:
+            lines.append(f"noise       {'; '.join(each.text for each in self.noise)}")
         lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
 

@@ -26,7 +26,8 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
-from orthaug.fitting.noise import Noise, check_noise, declared_noise, fit_coloured
+from orthaug.fitting.noise import Noise, declared_noise
+from orthaug.fitting.noise_estimation import check_noise, fit_coloured
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import check_cost, check_solver, checked_starts, choose_regularizations
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt

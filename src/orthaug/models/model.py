@@ -108,7 +108,7 @@ class Model(RecordModel, NotebookView):
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
     noise: NoiseModel | None = field(default=None, kw_only=True)
-    """The model of the errors' colour, for predictions; None for white errors."""
+    """The model of the errors' colour, for predictions; None where nobody asked for one."""
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
 
@@ -151,6 +151,11 @@ class Model(RecordModel, NotebookView):
         return self.parts_at(x).raw
 
     @property
+    def coloured(self) -> bool:
+        """Whether a noise model forecasts errors."""
+        return self.noise is not None and not self.noise.white
+
+    @property
     def theta_aux(self) -> Vector:
         """θ_aux (nθ,), fixed after training."""
         return np.asarray(self.numbers.theta_aux)
@@ -183,7 +188,7 @@ class Model(RecordModel, NotebookView):
             else:
                 parts = self._predict_ahead(experiment, record, horizon)
             found = trajectory(parts, experiment, experiment.outputs, first)
-            if self.noise is not None:
+            if self.coloured:
                 forecast = self._forecast(experiment, record, horizon)[:, -1]
                 found = replace(found, whole=found.model.copy())
                 found.model[first:] += forecast
@@ -312,7 +317,7 @@ class Model(RecordModel, NotebookView):
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0).swapaxes(1, 2)
         states = self.form.start(experiment.outputs, np.arange(first, first + len(windows)))
         arrays: tuple[np.ndarray, ...] = (states, windows)
-        if self.noise is not None:
+        if self.coloured:
             arrays = (*arrays, self._forecast(experiment, record, horizon))
         # Windows overlap: they are copied batch by batch
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))

@@ -88,6 +88,11 @@ class NoiseModel:
         return self.ar.shape[1]
 
     @property
+    def white(self) -> bool:
+        """True if the errors are white: no coefficients."""
+        return not any(map(sum, self.orders))
+
+    @property
     def invertible(self) -> bool:
         """True if all roots of C are inside the unit circle."""
         return all(np.abs(np.roots([1.0, *c])).max(initial=0.0) < _INSIDE for c in self.ma)
@@ -141,17 +146,15 @@ class NoiseModel:
             v, e = [new, *v][:p], [np.zeros_like(new), *e][:q]
         return np.stack(found, axis=1)
 
+    def word(self, o: int) -> str:
+        """Return the model of one output in a word."""
+        p, q = self.orders[o]
+        if not p or not q:
+            return f"AR({p})" if p else f"MA({q})" if q else "white"
+        return f"ARMA({p}, {q})"
+
     def __str__(self) -> str:
-        each = [
-            "white"
-            if not (p or q)
-            else f"AR({p})"
-            if not q
-            else f"MA({q})"
-            if not p
-            else f"ARMA({p}, {q})"
-            for p, q in self.orders
-        ]
+        each = [self.word(o) for o in range(len(self.orders))]
         return each[0] if len(set(each)) == 1 else ", ".join(each)
 
 
@@ -323,10 +326,11 @@ def _block(noise: NoiseModel) -> int:
 def _recursion(ma: Matrix, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return how the values of a block by 1/C follow its own input, and the q values before it."""
     ny, q = ma.shape
-    state = np.zeros((ny, q + size, size + q))  # rows: time, columns: inputs and past values
-    state[:, np.arange(q), size + np.arange(q)] = 1.0
-    for k in range(size):
-        state[:, q + k, k] = 1.0
+    state = np.zeros((ny, q + size, 1 + q))  # rows: time, columns: an impulse, and past values
+    state[:, np.arange(q), 1 + np.arange(q)] = 1.0
+    state[:, q, 0] = 1.0
+    for k in range(q, q + size):
         for i in range(q):
-            state[:, q + k] -= ma[:, i, None] * state[:, q + k - 1 - i]
-    return state[:, q:, :size], state[:, q:, size:]
+            state[:, k] -= ma[:, i, None] * state[:, k - 1 - i]
+    impulse = np.concatenate([state[:, q:, 0], np.zeros((ny, size))], axis=1)
+    return impulse[:, np.arange(size)[:, None] - np.arange(size)], state[:, q:, 1:]
