@@ -21,6 +21,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.jax import training_clock
 from orthaug._base.progress import LOG
 from orthaug.fitting.colour import burg
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -46,6 +47,7 @@ _SEARCH = (Limit(30, 30), 1e-6)  # the same where orders are compared
 _CHOICES = 2  # turns that choose the orders; later ones keep them
 _LONG = 12  # order of the autoregression that a search begins with
 _ROWS_PER_ORDER = 20
+_BEYOND = 2  # coefficients more than the best white model has: how far a search goes
 _MANY = 300_000  # entries of the derivatives: with more, orders are chosen with the learner held
 
 
@@ -95,38 +97,37 @@ def fit_coloured(
     given["learner"] = learner
     again = {**given, "initial": None}
     last = white = fit(problem, **given)
-    kept, settled = None, True
+    kept, settled, seconds = None, False, last.status.seconds
     for turn in range(_TURNS):
         if not last.status.ok or last.model.statistics.gram is None:
+            settled = True
             break
-        rows = _Rows.of(last)
+        began, rows = training_clock(), _Rows.of(last)
         if kept is None or (turn < _CHOICES and noise.chooses):
             found = _choose(rows, noise)
         else:
             found = _descend(rows, [(rows.nothing, kept)])
-        if not any(map(sum, found.noise.orders)):
-            LOG.info("noise: white errors are chosen")
+        seconds += training_clock() - began
+        LOG.info("noise: turn %d, %s, %s", turn + 1, found.noise, found.noise.values)
+        if found.noise.white:
             model = replace(white.model, noise=found.noise)
             return replace(white, model=model, warnings=(*left_out, *white.warnings))
-        LOG.info("noise: turn %d, %s, %s", turn + 1, found.noise, found.noise.values)
         same = kept is not None and kept.orders == found.noise.orders
         if same and kept is not None and found.apart(kept) < _SETTLED:
+            settled = True
             break
-        kept, settled = found.noise, False
+        kept = found.noise
         last = fit(problem.filtered(RowFilter(kept, problem.lengths)), **again)
-        if not last.learns:
-            settled = not last.at_bound
+        seconds += last.status.seconds
+        if not (last.learns or last.at_bound):  # the minimum over θ and η at once
+            settled = True
             break
-        chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
-        again |= {"initial": last.model, "regularization": chosen}
-    else:
-        settled = False
-    warnings = (*left_out, *last.warnings)
-    if kept is not None and not settled and last.learns:
-        settled = turn < _TURNS - 1
-    if not settled and not last.at_bound:
-        warnings = (*warnings, _unsettled())
-    return replace(_with_information(last), warnings=warnings)
+        if last.learns:
+            chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
+            again |= {"initial": last.model, "regularization": chosen}
+    warnings = (*left_out, *last.warnings, *([] if settled else [_unsettled()]))
+    status = replace(last.status, seconds=seconds)
+    return replace(_with_information(last), status=status, warnings=warnings)
 
 
 def _unsettled() -> Warning:
@@ -329,8 +330,7 @@ def _choose(rows: _Rows, noise: ARMA) -> _Found:
         orders = tuple(one.noise.orders[0] for one in each)
     else:
         orders = ((noise.ar, noise.ma),) * ny  # type: ignore[assignment]
-    nothing = NoiseModel.of(orders, np.zeros(sum(map(sum, orders))))
-    starts = [(rows.nothing, nothing)]
+    starts = [(rows.nothing, _nothing(orders))]
     if any(map(sum, orders)):
         long = _long_autoregression(rows)
         starts.append((long.moved, _regress(rows, long, orders)))
@@ -338,25 +338,27 @@ def _choose(rows: _Rows, noise: ARMA) -> _Found:
 
 
 def _choose_orders(rows: _Rows, pairs: Sequence[tuple[int, int]]) -> _Found:
-    """Return the minimum with the best orders of one output, all on the same rows."""
-    long = _long_autoregression(rows)
-    counted = sum(max(n - (rows.skip or 0), 0) for n in rows.lengths)
+    """Return the minimum with the best orders of one output, all on the same rows.
+
+    The search ends where models of two more coefficients are no better.
+    """
+    long, counted = _long_autoregression(rows), rows.filter(_nothing(((0, 0),))).counted
     tried: dict[tuple[int, int], _Found] = {}
+    scores: dict[tuple[int, int], tuple[bool, float]] = {}
     for p, q in pairs:
-        if (p + q) * _ROWS_PER_ORDER > counted:
+        best = min(scores, key=scores.__getitem__, default=None)
+        if best is not None and not scores[best][0] and p + q > sum(best) + _BEYOND:
+            break
+        if (p + q) * _ROWS_PER_ORDER > counted and tried:
             continue
-        starts = [(long.moved, _regress(rows, long, ((p, q),)))] if p + q else []
-        for before in ((p - 1, q), (p, q - 1)):  # never above a smaller model
-            if before in tried:
-                there = tried[before].noise
-                values = np.r_[there.ar[0], np.zeros(p - before[0])]
-                values = np.r_[values, there.ma[0], np.zeros(q - before[1])]
-                starts.append((tried[before].moved, NoiseModel.of(((p, q),), values)))
-        if not starts:
-            starts = [(rows.nothing, NoiseModel.of(((p, q),), np.zeros(p + q)))]
-        tried[p, q] = _descend(rows, starts, *_SEARCH)
-    scores = {}
-    for (p, q), one in tried.items():
+        starts = [(long.moved, _regress(rows, long, ((p, q),)))]
+        smaller = [tried[before] for before in ((p - 1, q), (p, q - 1)) if before in tried]
+        if smaller:  # never above a smaller model
+            before = min(smaller, key=lambda one: one.loss)
+            ar, ma = before.noise.ar[0], before.noise.ma[0]
+            values = np.r_[ar, np.zeros(p - len(ar)), ma, np.zeros(q - len(ma))]
+            starts.append((before.moved, NoiseModel.of(((p, q),), values)))
+        tried[p, q] = one = _descend(rows, starts, *_SEARCH)
         pieces = [piece[rows.skip or 0 :, 0] for piece in rows.pieces(one.innovations)]
         box = ljung_box([piece for piece in pieces if len(piece)], LAGS, p + q)
         square = max(float(np.sum(one.innovations**2)), 1e-300)
@@ -365,6 +367,11 @@ def _choose_orders(rows: _Rows, pairs: Sequence[tuple[int, int]]) -> _Found:
         scores[p, q] = (not white, counted * np.log(square / counted) + price * (p + q))
         LOG.debug("noise: orders %d, %d: white %s, %.6g", p, q, white, scores[p, q][1])
     return tried[min(scores, key=scores.__getitem__)]
+
+
+def _nothing(orders: Orders) -> NoiseModel:
+    """Return white errors as a model of these orders."""
+    return NoiseModel.of(orders, np.zeros(sum(map(sum, orders))))
 
 
 def _long_autoregression(rows: _Rows) -> _Found:
@@ -394,7 +401,7 @@ def _regress(rows: _Rows, long: _Found, orders: Orders) -> NoiseModel:
             if len(v) > begin:
                 past = [-v[begin - i : len(v) - i] for i in range(1, p + 1)]
                 past += [e[begin - i : len(e) - i] for i in range(1, q + 1)]
-                lines.append(np.stack(past, axis=1))
+                lines.append(np.reshape(past, (p + q, len(v) - begin)).T)
                 right.append(v[begin:])
         values.append(np.linalg.lstsq(np.concatenate(lines), np.concatenate(right), rcond=None)[0])
     return NoiseModel.of(orders, np.concatenate(values)).reflected()
