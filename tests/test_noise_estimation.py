@@ -326,8 +326,9 @@ def test_warnings_speak_of_what_the_noise_model_leaves() -> None:
     ],
 )
 def test_what_a_noise_model_is_not_for_is_refused(options: Any, words: str) -> None:
+    given: Any = {"learner": None, **options}
     with pytest.raises(oa.InputError, match=words):
-        oa.estimate(record(0), PHYSICS, **{"learner": None, **options})
+        oa.estimate(record(0), PHYSICS, **given)
 
 
 def test_coefficients_of_a_model_are_named_and_reflected() -> None:
@@ -366,7 +367,7 @@ kind = "none"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("noise")
     np.savetxt(
-        place / "run.csv", np.column_stack(signals(0)), delimiter=",", header="u,y", comments=""
+        place / "run.csv", np.column_stack(signals(7)), delimiter=",", header="u,y", comments=""
     )
     return place
 
@@ -374,9 +375,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.usefixtures("without_figures")
 def test_a_spec_declares_it_and_the_result_has_it(folder: Path) -> None:
     (folder / "spec.toml").write_text(SPEC + '[noise]\nmodel = "auto"\nlargest = 2\n')
-    run = CliRunner().invoke(app, ["fit", str(folder / "spec.toml"), "--out", str(folder / "out")])
-    assert run.exit_code == 0, run.output
-    assert "noise       y: MA(2), ma1 = " in run.output
+    done = run("fit", folder / "spec.toml", "--out", folder / "out")
+    assert done.code == 0, done.err
+    assert "noise       y: MA(2), ma1 = " in done.out
     result = json.loads((folder / "out" / "result.json").read_text())
     (noise,) = result["noise"]
     assert (noise["model"], noise["ar"], noise["ma"]) == ("MA(2)", 0, 2)
@@ -385,7 +386,7 @@ def test_a_spec_declares_it_and_the_result_has_it(folder: Path) -> None:
     assert noise["innovations_std"] == pytest.approx(0.5, rel=0.1) and noise["white_p"] > 0.01
     assert result["status"]["loss"] <= result["status"]["start_loss"]
     values = [one["value"] for one in result["parameters"]]
-    fit = oa.estimate(record(0), PHYSICS, learner=None, noise=oa.ARMA(ar=0, ma=2))
+    fit = oa.estimate(record(7), PHYSICS, learner=None, noise=oa.ARMA(ar=0, ma=2))
     np.testing.assert_allclose(values, fit.theta, rtol=1e-6)
     assert "MA(2)" in (folder / "out" / "report.html").read_text()
 
