@@ -67,6 +67,22 @@ def test_without_a_learner_the_fit_is_the_minimum_of_the_whole_cost(ar: int, ma:
     np.testing.assert_allclose(errors[ar:], cost(found)[ar:], atol=1e-10)
 
 
+def test_it_agrees_with_the_exact_likelihood_of_statsmodels() -> None:
+    """statsmodels 0.15.0, SARIMAX(y, exog=u, order=(1, 0, 1)): its values and standard errors."""
+    rng = np.random.default_rng(11)
+    u, e = rng.normal(size=(4000, 2)), 0.3 * rng.normal(size=4000)
+    e[0] = 0.0
+    v = lfilter([1.0, 0.5], [1.0, -0.6], e)
+    own = oa.Record.from_arrays(u, u @ [1.0, -0.4] + v, inputs=["p", "q"], outputs=["y"])
+    physics = oa.Baseline.from_terms([oa.Term("a", "p[k]"), oa.Term("b", "q[k]")])
+    fit = oa.estimate(own, physics, learner=None, noise=oa.ARMA(ar=1, ma=1))
+    assert fit.model.noise is not None and fit.model.noise.covariance is not None
+    np.testing.assert_allclose(fit.theta, [1.0034886, -0.3998449], rtol=1e-4)
+    np.testing.assert_allclose(fit.model.noise.values, [-0.61190745, 0.51111622], rtol=1e-3)
+    std = np.r_[np.asarray(fit.std), np.sqrt(np.diag(fit.model.noise.covariance))]
+    np.testing.assert_allclose(std, [0.00283222, 0.00290687, 0.01463694, 0.01589705], rtol=0.03)
+
+
 def test_several_stretches_each_begin_by_their_own_conditions() -> None:
     pieces = [signals(seed, rows) for seed, rows in ((1, 300), (2, 61), (3, 200))]
     experiments = tuple(oa.Record.from_arrays(u, y).experiments[0] for u, y in pieces)
@@ -194,7 +210,7 @@ def test_the_split_is_orthogonal_in_the_filtered_inner_product(learned: Any) -> 
         :, 0
     ]
     there = np.linalg.lstsq(phi, through.rows(problem.target)[:, 0], rcond=None)[0]
-    np.testing.assert_allclose(whole.theta, there, rtol=1e-8)  # generalised least squares (F17)
+    np.testing.assert_allclose(whole.theta, there, rtol=1e-8)  # generalised least squares
 
 
 def test_with_a_learner_the_coefficients_are_at_a_stationary_point(learned: Any) -> None:

@@ -1,4 +1,4 @@
-"""Noise models of lagged physics: orders, coefficients and covariance by prediction error (F17).
+"""Noise models of lagged physics: orders, coefficients and covariance by prediction error.
 
 The criterion is `‖W L(η)(Y − Φθ − F(w))‖²`, W the output weights, plus the prior of the weights. At
 given η it is that of filtered rows, which `estimate` minimises as any other. For given rows the

@@ -1,4 +1,4 @@
-"""Models of the errors' colour `D(q) v_k = C(q) e_k`, and the filter `L = D/C` of rows (F17).
+"""Models of the errors' colour `D(q) v_k = C(q) e_k`, and the filter `L = D/C` of rows.
 
 `y_k = φ(x_k)θ + f(x_k) + v_k` with white innovations e. Every output has polynomials of its own,
 monic, C with all roots inside the unit circle. `L = D/C` turns errors v into innovations, so the

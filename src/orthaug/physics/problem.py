@@ -109,7 +109,7 @@ class Problem:
     projection: Projection
     excitation: Excitation
     noise: RowFilter | None = field(default=None, kw_only=True)
-    """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY (F17)."""
+    """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY."""
 
     def __repr__(self) -> str:
         lags = ", ".join(str(lag) for lag in self.layout)
