@@ -36,7 +36,6 @@ from .data.preparation import Lowpass as Lowpass
 from .data.steps import Shift as Shift
 from .export import export as export
 from .export import numpy_step as numpy_step
-from .fitting import ARMA as ARMA
 from .fitting import Additive as Additive
 from .fitting import Auto as Auto
 from .fitting import Estimate as Estimate
@@ -50,6 +49,7 @@ from .fitting import Status as Status
 from .fitting import estimate as estimate
 from .fitting import orthogonalize as orthogonalize
 from .fitting.narx import AugmentedNARX as AugmentedNARX
+from .fitting.noise import ARMA as ARMA
 from .fitting.regressor import AugmentedRegressor as AugmentedRegressor
 from .fitting.solvers import AdamLBFGS as AdamLBFGS
 from .fitting.structures import BaselinePenalty as BaselinePenalty

@@ -5,7 +5,6 @@ from .criteria import Simulation as Simulation
 from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
 from .motion_estimates import MotionEstimate as MotionEstimate
-from .noise import ARMA as ARMA
 from .recursive import Recursive as Recursive
 from .solvers import LevenbergMarquardt as LevenbergMarquardt
 from .status import Status as Status

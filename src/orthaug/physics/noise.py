@@ -25,6 +25,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 
 _BLOCK = 64  # rows that one matrix filters; 32 to 128 take as long
+_SHARED = 4  # orders are filled up to a multiple of it, so that they share compiled programs
 _INSIDE = 1 - 1e-9  # roots of C: what is nearer to the unit circle keeps its start for ever
 
 Orders = tuple[tuple[int, int], ...]
@@ -287,7 +288,10 @@ class RowFilter:
             back = np.concatenate([back, np.zeros(short, dtype=int)])
         wide = -(-rows // _block(self.noise)) if arrays.place is None else len(arrays.follows)
         follows = np.concatenate([arrays.follows, np.ones(wide - len(arrays.follows))])
+        past, recent = (-n % _SHARED for n in (arrays.ar.shape[1], arrays.memory.shape[2]))
         one = arrays._replace(
+            ar=np.pad(arrays.ar, ((0, 0), (0, past))),
+            memory=np.pad(arrays.memory, ((0, 0), (0, 0), (recent, 0))),
             live=np.concatenate([arrays.live, np.zeros(short)]),
             follows=follows,
             matrix=np.asarray(matrix),
