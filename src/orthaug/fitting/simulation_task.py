@@ -27,7 +27,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.minimize import LEARNED, Descent
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import theta_block
-from orthaug.models.learners import Bound
+from orthaug.models.learners import Bound, remembers
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
 
@@ -181,10 +181,15 @@ class SimulationTask(ABC):
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
-        free_fit = plan.descend(
-            objective, best.p, solver, report, best.states, ceiling=ceiling, **options
+        # The weights of a memory are first needed when others have grown: too late for evidence
+        free_fit = (
+            None
+            if evidence and remembers(self.bound.learner)
+            else plan.descend(
+                objective, best.p, solver, report, best.states, ceiling=ceiling, **options
+            )
         )
-        if evidence and not _lowers_loss(free_fit, best.loss):
+        if evidence and (free_fit is None or not _lowers_loss(free_fit, best.loss)):
             free = plan.descend(
                 objective, best.p, solver.within_limit, report, best.states, ceiling=ceiling
             )
@@ -193,12 +198,13 @@ class SimulationTask(ABC):
                 again = plan.descend(
                     objective, point.p, solver, report, point.states, ceiling=ceiling, **options
                 )
-                free_fit = again if _lowers_loss(again, best.loss) else free_fit
+                free_fit = again if _lowers_loss(again, best.loss) else free_fit or free
                 spent = {
                     "iterations": free.iterations + free_fit.iterations,
                     "seconds": free.seconds + free_fit.seconds,
                 }
                 free_fit = free_fit._replace(**spent)
+            free_fit = free_fit or free
         return self._below_physics(free_fit)
 
     def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
