@@ -114,10 +114,11 @@ def add_memory(
 
 def _lag(source: str, name: str, tau: float, sampling_time: float, motion: Motion) -> str:
     """Return the equation of a first-order lag of a source."""
+    source = source if source.isidentifier() else f"({source})"
     if motion.scheme.discrete:
         kept = float(np.exp(-sampling_time / tau))
-        return f"{name} + {1 - kept:.6g}*(({source}) - {name})"
-    return f"(({source}) - {name})/{tau:.6g}"
+        return f"{name} + {1 - kept:.6g}*({source} - {name})"
+    return f"({source} - {name})/{tau:.6g}"
 
 
 def _spread(record: Record, count: int) -> Vector:
