@@ -252,6 +252,15 @@ def test_a_spec_declares_states_of_a_learner(project):
     assert done.code == 0, done.err
 
 
+def test_check_says_what_a_state_could_imitate(project):
+    text = " ".join(run("check", "spec.toml").out.split())
+    assert "The data determine m with any learner of these inputs" in text
+    assert "With its own state z1 it could also imitate k, by the past of its inputs" in text
+    spec = (project / "spec.toml").read_text().replace('inputs = ["v"]', 'inputs = ["force"]')
+    (project / "spec.toml").write_text(spec)
+    assert "own state" not in run("check", "spec.toml").out
+
+
 def test_a_spec_of_lagged_physics_is_refused(project):
     head = SPEC.partition("[motion.states]")[0]
     (project / "spec.toml").write_text(

@@ -185,7 +185,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             nothing, step = nothing_learned(), problem.record.sampling_time
             form = MotionDynamics(motion, problem.features, nothing, step, problem.substeps)
             run = (motion.coordinates.initial, identification.states, identification.inputs)
-            shared = imitation_before(form, *run)
+            shared = imitation_before(form, *run, segmented.segments.steps)
             seen = [str(entry) for entry in form.features]
             on_rows = shared_warnings(shared_of_motion(form, *run), seen)
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
@@ -307,7 +307,13 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         if not fit.status.ok or not fit.learns:
             return None, []
         seen = [str(entry) for entry in fit.model.form.features]
-        return MotionImitation.of(seen, fit.shared), shared_warnings(fit.shared, seen)
+        found, form = MotionImitation.of(seen, fit.shared), fit.model.form
+        if form.motion.memory:
+            first = replace(job.train.record, experiments=job.train.record.experiments[:1])
+            found = found.with_memory(
+                form, fit.theta, *np.split(fit.reach(first), [form.states], axis=1)
+            )
+        return found, shared_warnings(fit.shared, seen)
 
     def figures(
         self,

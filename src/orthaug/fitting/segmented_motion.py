@@ -102,7 +102,9 @@ class SegmentedMotion(SegmentedProblem):
         """Return the problem of physics alone with another motion, from its guessed starts."""
         problem = replace(self.problem, motion=motion, features=())
         dynamics = replace(self.dynamics, motion=motion)
-        other = replace(self, problem=problem, dynamics=dynamics, loose=self.loose[: len(motion.states)])
+        other = replace(
+            self, problem=problem, dynamics=dynamics, loose=self.loose[: len(motion.states)]
+        )
         layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
         return replace(other, **layout._asdict())
 

@@ -68,7 +68,7 @@ def check_time_constants(given: object, states: int) -> tuple[float, ...] | None
 
 
 def names_of_memory(motion: Motion, states: int) -> tuple[str, ...]:
-    """Return names of a learner's states that the motion does not use: z1, z2, …"""
+    """Return names of a learner's states that the motion does not use, such as z1 and z2."""
     taken = {*motion.known, *(output.name for output in motion.outputs)}
     prefix = "z"
     while any(f"{prefix}{i}" in taken for i in range(1, states + 1)):
