@@ -29,7 +29,13 @@ from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.noise import Noise, declared_noise
 from orthaug.fitting.noise_estimation import check_noise, fit_coloured
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.rules import check_cost, check_solver, checked_starts, choose_regularizations
+from orthaug.fitting.rules import (
+    check_cost,
+    check_no_memory,
+    check_solver,
+    checked_starts,
+    choose_regularizations,
+)
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
@@ -307,6 +313,7 @@ def fit(
     _check_types(initial=initial, validation=validation)
     options: dict[str, Any]
     learner = declared(learner)
+    check_no_memory(learner)
     _check_splittable(structure, problem.baseline, learner)
     coloured = declared_noise(noise)
     if coloured is not None:

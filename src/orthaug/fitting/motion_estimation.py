@@ -39,6 +39,7 @@ from orthaug.models.motion_model import MotionModel, TrainedSegments
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
+from orthaug.physics.memory import Memory
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -58,7 +59,7 @@ def pose_for(
     """
     check_type(record, Record, "record", "a Record")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    return pose_motion(record, motion, declared(learner).inputs, output_weights)
+    return pose_motion(record, motion, declared(learner).inputs, output_weights, Memory.of(learner))
 
 
 def fit_motion(
