@@ -42,8 +42,9 @@ from orthaug.inference.over_experiments import (
     split_without_each,
 )
 from orthaug.models.dynamics import Numbers
+from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
 from orthaug.physics.excitation import Excitation, of_gram
@@ -71,7 +72,7 @@ class MotionEstimate(AnyFit):
     Print `fit.summary()`; use `fit.model`; read `fit.parameters`.
     """
 
-    model: MotionModel
+    model: Model[MotionDynamics]
     status: Status
     restarts: tuple[Restart, ...]
     covariance: Matrix | None

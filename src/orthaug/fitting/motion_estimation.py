@@ -35,8 +35,10 @@ from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_conve
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling, declared, learns
-from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.model import Model, TrainedSegments
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
 from orthaug.physics.motion import Motion
@@ -175,14 +177,16 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
     return values if np.isfinite(values).all() else None
 
 
-def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner) -> MotionModel:
+def _model(
+    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner
+) -> Model[MotionDynamics]:
     record = plan.record
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise
     middle = None
     if noise is not None and learned.gram is not None and learned.middle is not None:
         middle = learned.middle(plan.problem.weight.whitened(noise))
-    model = MotionModel(
+    model = Model(
         form=plan.dynamics,
         numbers=plan.numbers(learned.coefficients, learned.weights),
         outputs=record.outputs,
@@ -192,8 +196,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
         largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
         deviation=plan.deviation,
         weight=plan.weight,
-        loose=plan.loose,
-        window=_WINDOWS[0] * (plan.dynamics.states + 1),
+        starts=EstimatedStates(_WINDOWS[0] * (plan.dynamics.states + 1), plan.loose),
         time_column=record.time_column,
         prepared=record.prepared,
         statistics=Statistics(
@@ -202,7 +205,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     )
     if not learned.ending.usable:
         return model
-    model = replace(model, window=_best_window(model, record))
+    model = _with_window(model, _best_window(model, record))
     return (
         model
         if not model.learns
@@ -210,7 +213,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     )
 
 
-def _with_limits(model: MotionModel, record: Record) -> MotionModel:
+def _with_limits(model: Model[MotionDynamics], record: Record) -> Model[MotionDynamics]:
     """Return the model with the range of its features over the fitted run.
 
     Beyond that range the correction stays constant or fades.
@@ -221,25 +224,31 @@ def _with_limits(model: MotionModel, record: Record) -> MotionModel:
     nx = model.form.states
 
     def features(points: Matrix) -> Matrix:
-        return np.asarray(model.form.seen(points[:, :nx].T, points[:, nx:].T, np)).T
+        return model.form.features_at(points[:, :nx], points[:, nx:])
 
     pull = pull_of(features, model.reach(record))
     return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
-def _feature_range(model: MotionModel, record: Record) -> Matrix | None:
+def _feature_range(model: Model[MotionDynamics], record: Record) -> Matrix | None:
     """Return the least and largest (2, nz) of the learner's features over the free run.
 
     None where it has no finite ones.
     """
     states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
     with np.errstate(all="ignore"):
-        features = np.asarray(model.form.seen(states.T, inputs.T, np))
-    finite = features[:, np.isfinite(features).all(axis=0)]
-    return np.stack([finite.min(axis=1), finite.max(axis=1)]) if finite.size else None
+        features = model.form.features_at(states, inputs)
+    finite = features[np.isfinite(features).all(axis=1)]
+    return np.stack([finite.min(axis=0), finite.max(axis=0)]) if finite.size else None
 
 
-def _best_window(model: MotionModel, record: Record) -> int:
+def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynamics]:
+    """Return the model with another number of rows that give a state to predict from."""
+    assert isinstance(model.starts, EstimatedStates)
+    return replace(model, starts=replace(model.starts, window=window))
+
+
+def _best_window(model: Model[MotionDynamics], record: Record) -> int:
     """Return the window of rows that predicts one step ahead best.
 
     On some of the training data.
@@ -252,7 +261,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
             break
         part = replace(record, experiments=(longest,))
         try:
-            response = replace(model, window=window).predict(part)
+            response = _with_window(model, window).predict(part)
         except InputError:  # not even one window fits
             break
         (trajectory,) = response.trajectories
@@ -267,7 +276,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
     return best
 
 
-def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
+def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstimate:
     """Return the estimate of a saved model with its training data, to split again.
 
     It lacks the results of its training.

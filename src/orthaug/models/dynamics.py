@@ -6,15 +6,23 @@ case whose state is the past outputs.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
+from orthaug.physics.parameters import Coordinates
+
+if TYPE_CHECKING:
+    from orthaug.models.learners import Bound
+
+BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 
 AnyArray = Any  # of NumPy or of JAX
 
@@ -77,6 +85,13 @@ class Parts(NamedTuple):
         return self.baseline + self.learner
 
 
+class Run(NamedTuple):
+    """States before the rows of a free run (T, n0), and the outputs of its steps (T, ny)."""
+
+    states: Any
+    parts: Parts
+
+
 @runtime_checkable
 class Dynamics(Protocol):
     """A model without its numbers; hashable, so that compiled programs are reused.
@@ -87,6 +102,39 @@ class Dynamics(Protocol):
 
     @property
     def outputs(self) -> tuple[str, ...]: ...
+
+    @property
+    def bound(self) -> Bound:
+        """The learner with its sizes."""
+        ...
+
+    @property
+    def entries(self) -> tuple[Expression, ...]:
+        """What the learner sees, as expressions."""
+        ...
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        ...
+
+    @property
+    def physics_only(self) -> Dynamics:
+        """These dynamics without the learner."""
+        ...
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The parameters of the physics, and the map from θ to their values."""
+        ...
+
+    @property
+    def separates(self) -> bool:
+        """True if a step gives its output in the parts of physics and learner.
+
+        Otherwise a run of the physics alone, from the same start, is the part of the physics.
+        """
+        ...
 
     @property
     def linear(self) -> bool:
@@ -149,16 +197,28 @@ class Dynamics(Protocol):
         """
         ...
 
-    def scaled_features(
-        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Matrix | None:
-        """Return the learner's features (T, nz) along a free run; None if they are not known.
+    def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
+        """Return the learner's features (T, nz) at states (T, n0) and rows of inputs (T, nu)."""
+        ...
 
-        They are in [-1, 1] over the training data.
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The entries of the state as expressions write them."""
+        ...
 
-        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu)
-        as its steps read them.
-        """
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        """Yield name, physics and learner (T,) of each learned equation or output along a run."""
+        ...
+
+    @property
+    def has_range(self) -> bool:
+        """True if the range of the learner's features in training is known."""
+        ...
+
+    def run(self, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        """Return the free run from a state along rows of inputs (T, nu)."""
         ...
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
@@ -228,10 +288,10 @@ class AutodiffDynamics:
     def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
 
-    def scaled_features(
-        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Matrix | None:
-        return None
+    has_range = True
+
+    def run(self: Any, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        return free_run(self, numbers, start, inputs)
 
     def states_at(
         self: Dynamics,
@@ -240,12 +300,8 @@ class AutodiffDynamics:
         inputs: Matrix,
         rows: Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
-        padded = np.zeros((padded_length(len(inputs)), inputs.shape[1]))
-        padded[: len(inputs)] = inputs
         start = self.start(outputs, [self.first_row])[0]
-        return np.asarray(_states(self, numbers, start, padded))[
-            np.asarray(rows, dtype=int) - self.first_row
-        ]
+        return self.run(numbers, start, inputs).states[np.asarray(rows, dtype=int) - self.first_row]
 
     def first_slopes(self: Dynamics, width: int) -> Any:
         n0 = self.states
@@ -277,11 +333,61 @@ class AutodiffDynamics:
         return self.local(numbers, state, inputs).along(slopes)
 
 
+def free_run(form: Dynamics, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+    """Return the free run from a state along rows of inputs (T, nu), a batch of them at a time."""
+    state, pieces = start, []
+    for begin in range(0, len(inputs), BATCH):
+        rows = inputs[begin : begin + BATCH]
+        padded = np.pad(rows, ((0, BATCH - len(rows)), (0, 0)), mode="edge")
+        state, run = _scan(form, numbers, state, padded)
+        pieces.append([np.asarray(part)[: len(rows)] for part in (run.states, *run.parts)])
+    states, *parts = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
+    return Run(states, Parts(*parts))
+
+
 @partial(jax.jit, static_argnames="form")
-def _states(
+def _scan(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
-) -> Float[Array, "T n0"]:
-    """Return the state at every row of a free run."""
-    return jax.lax.scan(
-        lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs
-    )[1]
+) -> tuple[Float[Array, "n0"], Run]:
+    """Return the state behind the rows, and the run along them."""
+    numbers = form.prepare(numbers)
+
+    def step(state: Any, row: Any) -> tuple[Any, Run]:
+        following, parts = form.step(numbers, state, row)
+        return following, Run(state, parts)
+
+    return jax.lax.scan(step, state, inputs)
+
+
+@partial(jax.jit, static_argnames="form")
+def last_outputs(
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "T nu m"],
+    steps: Any,
+) -> Parts:
+    """Return the last outputs (ny, m) of `steps` of runs side by side."""
+    numbers = form.prepare(numbers)
+    side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
+    states = jax.lax.fori_loop(
+        0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states
+    )
+    return side_by_side(states, inputs[steps - 1])[1]
+
+
+def in_batches(
+    function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = BATCH
+) -> Parts:
+    """Call `function` on batches of rows, padded to one shape, and concatenate its results."""
+    count = len(rows[0])
+    size, pieces = min(BATCH, largest), []
+    for begin in range(0, count, size):
+        batch = [array[begin : begin + size] for array in rows]
+        padding = size - len(batch[0])
+        padded = [
+            np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch
+        ]
+        parts = function(*padded)
+        pieces.append([np.asarray(part)[: size - padding] for part in parts])
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))
