@@ -21,6 +21,7 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import (
     check_motion_choices,
+    check_sizes,
     check_solver,
     checked_starts,
     choose_regularizations,
@@ -30,8 +31,9 @@ from orthaug.fitting.silence import is_silenced, learner_silent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, plan_runs, train
+from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
 from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_converged, withheld
+from orthaug.fitting.warm_motion import WarmMotionTask, check_initial_motion
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling, declared, learns
@@ -51,16 +53,24 @@ left out.
 
 
 def pose_for(
-    record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
+    record: Record,
+    motion: Motion,
+    learner: Learner | None,
+    output_weights: str | Sequence[float],
+    initial: Model[MotionDynamics] | None = None,
 ) -> MotionProblem:
-    """Return the problem of a motion with the inputs of a learner.
+    """Return the problem of a motion with the inputs of a learner, or of an earlier model's.
 
     Raises:
-        InputError: as `pose_motion`.
+        InputError: as `pose_motion`; a model that is not of this motion.
     """
     check_type(record, Record, "record", "a Record")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    return pose_motion(record, motion, declared(learner).inputs, output_weights)
+    inputs = declared(learner).inputs
+    if initial is not None:
+        check_initial_motion(initial, motion)
+        inputs = [entry.text for entry in initial.form.entries]
+    return pose_motion(record, motion, inputs, output_weights)
 
 
 def fit_motion(
@@ -75,6 +85,7 @@ def fit_motion(
     seed: int = 0,
     blocks: int = 4,
     fallback: bool = True,
+    initial: Model[MotionDynamics] | None = None,
     validation: Record | None = None,
     progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
@@ -85,7 +96,7 @@ def fit_motion(
     Raises:
         InputError: what a motion cannot be trained with.
     """
-    learner = declared(learner)
+    learner = declared(learner if initial is None else initial.form.bound.learner)
     criterion = DEFAULT if criterion.automatic else criterion
     criterion = criterion.on(problem.record)
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
@@ -94,14 +105,22 @@ def fit_motion(
     choices = choose_regularizations(
         regularization, solver, criterion, structure, learner=learner, **conditions
     )
-    restarts, seed = checked_starts(restarts, seed, warm=False, ensemble=False)
+    restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=False)
     check_solver(solver, criterion, choices if learns(learner) else ())
-    engine = runs_on(engine) if restarts * len(choices) > 1 else engine
+    runs = len(choices) * (restarts if initial is None else 1)
+    check_sizes(problem, learner, iterations=solver.iterations, runs=runs, room=engine.room())
+    engine = runs_on(engine) if runs > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
-    task = MotionTask.of(problem, learner, criterion, engine).with_checkpoints(kept)
-    starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
-    retry = isinstance(regularization, str) and regularization == "auto"
-    chosen = Choice(validation, blocks, fallback, retry=retry)
+    if initial is None:
+        task = MotionTask.of(problem, learner, criterion, engine)
+        starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
+    else:
+        check_initial_motion(initial, problem.motion)
+        task = WarmMotionTask.from_model(problem, initial, criterion, engine)
+        starts = [PlannedRun(0, np.asarray(initial.numbers.weights), c) for c in choices]
+    task = task.with_checkpoints(kept)
+    retry = initial is None and isinstance(regularization, str) and regularization == "auto"
+    chosen = Choice(validation, blocks if initial is None else 0, fallback, retry=retry)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,10 +17,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
+from orthaug.models.learners import Bound, nothing_learned
 from orthaug.physics.parameters import Coordinates
-
-if TYPE_CHECKING:
-    from orthaug.models.learners import Bound
 
 BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 
@@ -280,15 +278,40 @@ class Local(NamedTuple):
 class AutodiffDynamics:
     """Derivatives by automatic differentiation of `step`, for dynamics without a faster way.
 
-    `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it.
+    `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it. Without
+    a learner and without parameters, if nothing else is written.
     """
 
+    bound: Bound = nothing_learned()
+    coordinates: Any = Coordinates(())
+    entries: tuple[Expression, ...] = ()
+    separates = False
     differentiable = True
 
     def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
 
     has_range = True
+
+    @property
+    def learns(self) -> bool:
+        return self.bound.learns
+
+    @property
+    def physics_only(self) -> Any:
+        return self
+
+    @property
+    def state_names(self: Any) -> tuple[str, ...]:
+        return tuple(f"x{i + 1}" for i in range(self.states))
+
+    def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
+        return np.zeros((len(states), 0))
+
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        return iter(())
 
     def run(self: Any, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
         return free_run(self, numbers, start, inputs)
