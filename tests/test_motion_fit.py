@@ -645,6 +645,16 @@ def test_a_warm_start_goes_on_from_an_earlier_model(fitted: oa.MotionEstimate, t
         assert again.values == pytest.approx(fitted.values, rel=0.02)
 
 
+def test_a_warm_start_keeps_what_the_learner_remembers_by() -> None:
+    options = {"criterion": WHOLE, "blocks": 0, "fallback": False}
+    options |= {"solver": oa.LevenbergMarquardt(5)}
+    learner = oa.MLP((3,), inputs=("v",), states=1)
+    first = oa.estimate(data(), spring(learned=True), learner=learner, **options)
+    again = oa.estimate(data(250), spring(learned=True), initial=first, **options)
+    assert again.model.form.motion.states == first.model.form.motion.states
+    assert again.model.form.entries == first.model.form.entries
+
+
 def test_warm_starts_that_fit_no_motion_are_refused(fitted: oa.MotionEstimate) -> None:
     alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     lagged = oa.estimate(data(), oa.Baseline.from_terms([oa.Term("a", "y[k-1]")]), learner=None)

@@ -40,6 +40,8 @@ _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that 
 _CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
 _STATIC = 5
 _MULTIPLIED = 8  # features, of which products of pairs are taken
+_FILLINGS, _SEED = 3, 20261125  # of what the columns explain with noise, and their key
+_MOST_USED = 0.9  # of the rows, by columns
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
@@ -167,7 +169,7 @@ def _fit_physics(model: Model, record: Record) -> tuple[Vector, list[LinearRun]]
         pieces, colours = _colour_rows(runs, base)
         rows, nt = np.concatenate([_filter_piece(piece, colours) for piece in pieces]), len(theta)
         step, before = (
-            _least_squares(rows[:, :-1], rows[:, -1])[:nt],
+            _step_beside(rows[:, :nt], rows[:, nt:-1], rows[:, -1]),
             _residual_sum(rows[:, nt:-1], rows[:, -1]),
         )
         scale, trial, after = _scale(runs), None, np.inf
@@ -194,6 +196,22 @@ def _least_squares(columns: Matrix, target: Vector) -> Vector:
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1.0)
     return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
+
+
+def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
+    """Return the coefficients of columns beside others, 0 along what the others replace.
+
+    A parameter that the learner imitates would drift far for nothing, to where the run is no longer
+    linear in what compensates it.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    q = _range(others)
+    rest = columns / size
+    rest = rest - q @ (q.T @ rest)
+    left, values, right = np.linalg.svd(rest, full_matrices=False)
+    kept = values > _OWN
+    return right[kept].T @ ((left[:, kept].T @ target) / values[kept]) / size
 
 
 def _residual_sum(columns: Matrix, target: Vector) -> float:
@@ -429,13 +447,28 @@ def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> 
 def _colour_rows(
     runs: list[LinearRun], base: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[Vector]]:
-    """Return columns and errors, and the autoregression of each output's remaining errors."""
+    """Return columns and errors, and the autoregression of each output's remaining errors.
+
+    What the columns explain of the errors is noise, too, and mostly of the frequencies of the
+    inputs. Without it the errors would seem to have hardly any there, and the filter would enlarge
+    what is there until it looks like structure. So noise of the colour found takes its place.
+    """
     pieces = _pieces(runs, base, _scale(runs))
-    rest = _residual_pieces(
-        [piece[..., :-1] for piece in pieces], [piece[..., -1] for piece in pieces]
-    )
-    colours = [whitening_filter([piece[:, o] for piece in rest]) for o in range(base[0].shape[1])]
-    return pieces, [np.ones(1) if a is None else a for a in colours]
+    flat, lengths = np.concatenate(pieces), np.cumsum([len(piece) for piece in pieces])[:-1]
+    n, ny = flat.shape[:2]
+    q = _range(flat[..., :-1].reshape(n * ny, -1))
+    target = flat[..., -1].reshape(-1)
+    rest = target - q @ (q.T @ target)
+    colours, shown = [np.ones(1)] * ny, float(np.sqrt(1 - min(q.shape[1] / (n * ny), _MOST_USED)))
+    drawn = np.random.default_rng(_SEED).standard_normal((n, ny))
+    for _ in range(_FILLINGS):
+        sizes = rest.reshape(n, ny).std(axis=0) / shown
+        noise = np.stack([lfilter([1.0], a, drawn[:, o]) for o, a in enumerate(colours)], axis=1)
+        noise = (noise / noise.std(axis=0) * sizes).reshape(-1)
+        whole = np.split((rest + q @ (q.T @ noise)).reshape(n, ny), lengths)
+        found = [whitening_filter([piece[:, o] for piece in whole]) for o in range(ny)]
+        colours = [np.ones(1) if a is None else a for a in found]
+    return pieces, colours
 
 
 def _test_families(
@@ -480,15 +513,6 @@ def _best_family(entries: list[FamilyTest]) -> FamilyTest | None:
     return max(
         (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
     )
-
-
-def _residual_pieces(columns: list[np.ndarray], errors: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the errors that least squares on the columns leaves, pieces of (T, ny)."""
-    flat, lengths = np.concatenate(columns), np.cumsum([len(piece) for piece in columns])[:-1]
-    target, ny = np.concatenate(errors), errors[0].shape[1]
-    q = _range(flat.reshape(len(flat) * ny, -1))
-    rest = target.reshape(-1) - q @ (q.T @ target.reshape(-1))
-    return np.split(rest.reshape(-1, ny), lengths)
 
 
 def _range(columns: Matrix) -> Matrix:

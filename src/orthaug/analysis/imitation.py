@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.mapped_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
-from orthaug.inference.motion_split import shared_of_motion
+from orthaug.inference.motion_split import learned_places, shared_of_motion, slopes_at
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
@@ -24,6 +24,10 @@ _STILL = 1e-8  # change of a physical parameter along a shared direction, relati
 _ALTERNATIVES = 8
 # Of a regressor's norm: what widens a standard error twenty times, as in `orthaug select`
 _NEARLY = 0.05
+_LAGS, _FEWEST_ROWS = 12, 60  # of each input, and rows on which they are tried
+# Of a slope's variance: what lags leave of it is then 3 % of its size
+_FOLLOWED = 1e-3
+_DISTINCT = 1e-6  # of a column's size: less of it beside others is rounding
 
 
 @dataclass(frozen=True)
@@ -128,11 +132,16 @@ class Imitation:
         )
 
 
+@dataclass(frozen=True)
 class MotionImitation(Imitation):
     """Parts of a motion that a learner on these inputs could imitate.
 
-    Directions are those of the parameters' coordinates, logarithms of positive ones.
+    Directions are those of the parameters' coordinates, logarithms of positive ones. `remembered`
+    are the parameters that it could follow by states of its own, which `memory` names.
     """
+
+    memory: tuple[str, ...] = ()
+    remembered: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
@@ -146,19 +155,44 @@ class MotionImitation(Imitation):
         if not self.directions:
             return (
                 f"{sees} and could imitate no change of a parameter: the data determine all of "
-                "them."
+                f"them.{self._remembered}"
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
         text = (
             f"{sees} and could imitate a change of {moved}. Along this change the data alone "
             "do not determine the parameters; the physics nearest to the fitted motion does."
         )
-        if self.determined:
-            text += (
-                f" The data determine {', '.join(self.determined)} with any learner of these "
-                "inputs."
-            )
-        return text
+        determined = [name for name in self.determined if name not in self.remembered]
+        if determined:
+            text += f" The data determine {', '.join(determined)} with any learner of these inputs."
+        return text + self._remembered
+
+    def with_memory(self, form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> Self:
+        """Return the imitation with what the states of the learner could follow along a run.
+
+        The rows follow each other in time.
+        """
+        memory = form.motion.memory
+        if not memory or self.everything:
+            return self
+        names = [name for name in form.motion.names if name in self.determined]
+        followed = _followed_by_memory(form, q, x, u)
+        remembered = tuple(name for name in names if name in followed)
+        return replace(self, memory=memory, remembered=remembered)
+
+    @property
+    def _remembered(self) -> str:
+        """Sentences on parameters that the learner's own states could follow; empty for none."""
+        if not self.remembered:
+            return ""
+        state = "state" if len(self.memory) == 1 else "states"
+        names = _list_words(self.remembered)
+        return (
+            f" With its own {state} {', '.join(self.memory)} it could also imitate {names}, by the "
+            f"past of its inputs. The interval of {names} holds for the solution that was found: "
+            "it excludes others that describe the data as well. Compare it with a fit of fewer "
+            "states or other inputs."
+        )
 
 
 def imitation(
@@ -276,11 +310,14 @@ def _list_words(words: tuple[str, ...] | list[str]) -> str:
     )
 
 
-def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> MotionImitation:
+def imitation_before(
+    form: MotionDynamics, q: Vector, x: Matrix, u: Matrix, together: int
+) -> MotionImitation:
     """Return the imitation for a learner on the form's features, and for others.
 
     Args:
         x: states (M, nx) of a run at the coordinates q; `u` its inputs (M, nu).
+        together: the first rows, which follow each other in time.
     """
     own = tuple(str(entry) for entry in form.features)
     others = []
@@ -292,7 +329,57 @@ def imitation_before(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> M
             others.append(
                 Alternative.of(texts, shared_of_motion(replace(form, features=features), q, x, u))
             )
-    return MotionImitation.of(own, shared_of_motion(form, q, x, u), None, tuple(others))
+    found = MotionImitation.of(own, shared_of_motion(form, q, x, u), None, tuple(others))
+    return found.with_memory(form, q, x[:together], u[:together])
+
+
+def _followed_by_memory(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> set[str]:
+    """Return the parameters whose slopes a few lags of the learner's inputs follow (DESIGN F15).
+
+    A slope is shared if it is a causal function of what the learner sees. Lags of each input are
+    tried from a few samples to an integral; as many are taken as the learner has states, those that
+    explain most.
+    """
+    from scipy.signal import lfilter  # slow to import, and few fits need it
+
+    motion, nx = form.motion, x.shape[1]
+    places = [i for i in learned_places(motion) if i >= nx or not motion.states[i].memory]
+    slopes = np.asarray(slopes_at(form, q, x, u))[:, places]
+    z = np.asarray(form.seen(x.T, u.T, np)).T
+    own = [i for i, entry in enumerate(form.features) if str(entry) not in motion.memory]
+    kept = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(z).all(axis=1)
+    if kept.sum() < _FEWEST_ROWS:
+        return set()
+    slopes, z = slopes[kept], z[kept][:, own]
+    z = z / np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
+    kept_per_sample = 1 - np.append(np.geomspace(1 / len(z), 0.2, _LAGS), 0.0)
+    bank = np.concatenate([lfilter([1.0], [1.0, -a], z, axis=0) for a in kept_per_sample], axis=1)
+    static = np.concatenate([np.ones((len(z), 1)), z], axis=1)
+    followed = set()
+    for j, name in enumerate(motion.names):
+        moved = [slopes[:, i, j] for i in range(len(places)) if np.ptp(slopes[:, i, j]) > 0]
+        if moved and all(
+            _least_left(column, static, bank, len(motion.memory)) < _FOLLOWED for column in moved
+        ):
+            followed.add(name)
+    return followed
+
+
+def _least_left(target: Vector, columns: Matrix, others: Matrix, most: int) -> float:
+    """Return the share of a target's variance that columns and the best few others leave."""
+    total = float(np.var(target)) * len(target)
+    for step in range(most + 1):
+        q = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+        rest = target - q @ (q.T @ target)
+        left = float(rest @ rest) / total
+        if step == most or left < _FOLLOWED:
+            return left
+        beside = others - q @ (q.T @ others)
+        size = np.linalg.norm(beside, axis=0)
+        own = size > _DISTINCT * np.linalg.norm(others, axis=0)
+        gained = np.where(own, (beside.T @ rest) ** 2 / np.where(own, size, 1.0) ** 2, 0.0)
+        columns = np.column_stack([columns, beside[:, int(np.argmax(gained))]])
+    return 1.0
 
 
 def _choices(motion: Motion) -> Iterator[tuple[str, ...]]:

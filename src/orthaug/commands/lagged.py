@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from orthaug._base.errors import InputError, Warning
+from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug.analysis.imitation import Imitation, imitation
 from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.suspects import Suspect
 from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.job import Job, JobPhysics, Variant
 from orthaug.commands.parts import Part
-from orthaug.commands.spec import Spec
+from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import check_suspects, declare_suspects
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
@@ -25,6 +25,7 @@ from orthaug.data.sources import RecordSource
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
+from orthaug.fitting.rules import check_no_memory
 from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.physics import ill_conditioned
@@ -70,6 +71,10 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
     @classmethod
     def declare(cls, spec: Spec, step: float | None) -> Self:
         baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
+        try:
+            check_no_memory(spec.declared_learner())
+        except KeyedError as error:
+            raise spec_error(error) from None
         physics = None if step is None else spec.physics_map(step)
         if physics is not None:
             baseline = with_initial(physics, baseline)

@@ -18,6 +18,7 @@ from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record
 from orthaug.fitting.rules import check_motion_choices, check_solver, choose_regularizations
 from orthaug.inference.measures import Measure, Support
+from orthaug.physics.memory import Memory
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 from orthaug.reports.result import CheckResult, MeasureResult
@@ -127,8 +128,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         return 0, len(self.motion.states) + 1
 
     def pose(self, spec: Spec, record: Record, **options: Any) -> MotionProblem:
-        inputs = spec.learner_inputs() if spec.declared_learner() is not None else None
-        return pose_motion(record, self.motion, inputs, spec.training.output_weights, **options)
+        learner, weights = spec.declared_learner(), spec.training.output_weights
+        inputs = spec.learner_inputs() if learner is not None else None
+        return pose_motion(record, self.motion, inputs, weights, Memory.of(learner), **options)
 
     def under(self, measure: Measure, spec: Spec, problem: MotionProblem) -> Self:
         """Return the physics with the suspects of the spec; the measure is tried.
@@ -183,7 +185,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             nothing, step = nothing_learned(), problem.record.sampling_time
             form = MotionDynamics(motion, problem.features, nothing, step, problem.substeps)
             run = (motion.coordinates.initial, identification.states, identification.inputs)
-            shared = imitation_before(form, *run)
+            shared = imitation_before(form, *run, segmented.segments.steps)
             seen = [str(entry) for entry in form.features]
             on_rows = shared_warnings(shared_of_motion(form, *run), seen)
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
@@ -305,7 +307,13 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         if not fit.status.ok or not fit.learns:
             return None, []
         seen = [str(entry) for entry in fit.model.form.features]
-        return MotionImitation.of(seen, fit.shared), shared_warnings(fit.shared, seen)
+        found, form = MotionImitation.of(seen, fit.shared), fit.model.form
+        if form.motion.memory:
+            first = replace(job.train.record, experiments=job.train.record.experiments[:1])
+            found = found.with_memory(
+                form, fit.theta, *np.split(fit.reach(first), [form.states], axis=1)
+            )
+        return found, shared_warnings(fit.shared, seen)
 
     def figures(
         self,

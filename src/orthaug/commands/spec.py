@@ -51,7 +51,11 @@ Regularization = (
     Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 )
 
-_SECTIONS = {"learner": "learner", "kind": "structure.kind"}  # of keys that are not in [training]
+_SECTIONS = {  # of keys that are not in [training]
+    "learner": "learner",
+    "states": "learner.states",
+    "kind": "structure.kind",
+}
 _BESIDE_MOTION = {
     "baseline": "expected one of them, because both are the physics",
     "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "

@@ -28,7 +28,13 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.rules import check_sizes, check_solver, checked_starts, choose_regularizations
+from orthaug.fitting.rules import (
+    check_no_memory,
+    check_sizes,
+    check_solver,
+    checked_starts,
+    choose_regularizations,
+)
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
@@ -300,6 +306,7 @@ def fit(
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
     learner = declared(learner)
+    check_no_memory(learner)
     _check_splittable(structure, problem.baseline, learner)
     if criterion.automatic and _may_decide(
         problem, solver, structure, warm=initial is not None, ensemble=ensemble

@@ -33,7 +33,7 @@ from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
 from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_converged, withheld
-from orthaug.fitting.warm_motion import WarmMotionTask, check_initial_motion
+from orthaug.fitting.warm_motion import WarmMotionTask, check_initial_motion, with_its_memory
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling, declared, learns
@@ -43,6 +43,7 @@ from orthaug.models.rows import Engine, InMemory
 from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
+from orthaug.physics.memory import Memory
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -66,11 +67,13 @@ def pose_for(
     """
     check_type(record, Record, "record", "a Record")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    inputs = declared(learner).inputs
-    if initial is not None:
-        check_initial_motion(initial, motion)
-        inputs = [entry.text for entry in initial.form.entries]
-    return pose_motion(record, motion, inputs, output_weights)
+    if initial is None:
+        return pose_motion(
+            record, motion, declared(learner).inputs, output_weights, Memory.of(learner)
+        )
+    motion = with_its_memory(initial, motion)
+    check_initial_motion(initial, motion)
+    return pose_motion(record, motion, [e.text for e in initial.form.entries], output_weights)
 
 
 def fit_motion(

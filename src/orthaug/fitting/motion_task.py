@@ -224,9 +224,9 @@ class MotionTask(SimulationTask):
 
         Without an end where no run of it is finite.
         """
-        alone = replace(self, plan=self.plan.physics_only)
-        if self.physics is not None:
-            return alone, alone.learned(self.physics)
+        alone = replace(self, plan=self.plan.physics_only)._without_memory()
+        if alone.physics is not None:
+            return alone, alone.learned(alone.physics)
         unknown = ErrorStatistics(None, None, 0.0, np.nan, {})
         initial = self.problem.motion.coordinates.initial
         nothing: dict[str, Any] = {
@@ -238,6 +238,28 @@ class MotionTask(SimulationTask):
         return alone, TrainedLearner(
             scaling=alone.plan.scaling, unit=alone.plan.unit, ending=Ending.NON_FINITE, **nothing
         )
+
+    def _without_memory(self) -> MotionTask:
+        """Return the task of physics alone without a learner's states, on which no output depends.
+
+        The parameters stay, and so do the starts of the other states.
+        """
+        motion = self.problem.motion
+        if not motion.memory:
+            return self
+        kept = len(motion.states) - len(motion.memory)
+        plan = self.plan.with_motion(motion.without_memory)
+        if self.physics is None:
+            return replace(self, plan=plan)
+        end = self.physics.end
+        states = np.asarray(end.point.states)[:, :kept]
+        plan = plan.from_states(np.asarray(self.plan.segments.start)[:, :kept])
+        objective = plan.objective()
+        objective = replace(objective, weight=self.physics.objective.weight)
+        point = objective.evaluate(end.point.theta, Start(states))
+        own = end._replace(point=point, linear=objective.linearise(point))
+        physics = self.physics._replace(objective=objective, end=own)
+        return replace(self, plan=plan, physics=physics)
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return the best member: medians of outputs follow no equations of motion."""

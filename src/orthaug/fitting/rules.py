@@ -13,7 +13,7 @@ from orthaug._base.memory import check_limit, check_memory, in_words
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import SOLVERS, Solver
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Learner, learns
+from orthaug.models.learners import Learner, learns, remembers
 from orthaug.models.rows import Room
 from orthaug.physics.motion import Motion
 
@@ -93,6 +93,18 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
                 "regularization",
                 f" = {choice}; expected solver {able} with it",
             )
+
+
+def check_no_memory(learner: Learner | None) -> None:
+    """Raise InputError for a learner with states of its own beside lagged physics."""
+    if remembers(learner):
+        raise KeyedError(
+            "a learner has `states` beside equations of motion only; lagged physics remembers by "
+            "its lags. Give the learner more lags as `inputs`, or write the physics as a motion.",
+            "states",
+            f" = {getattr(learner, 'states', 0)}; a learner of lagged physics has no states. Give "
+            "it more lags in [lags], or write the physics as a [motion]",
+        )
 
 
 def choose_regularizations(

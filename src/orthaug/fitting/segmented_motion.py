@@ -24,6 +24,7 @@ from orthaug.models.learners import Bound, Scaling
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.models.starts import FIRST_ROWS
+from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
 
 
@@ -96,6 +97,16 @@ class SegmentedMotion(SegmentedProblem):
         """The problem without a learner."""
         nothing = Scaling(np.zeros(0), np.ones(0))
         return replace(self, dynamics=self.dynamics.physics_only, scaling=nothing, unit=np.ones(0))
+
+    def with_motion(self, motion: Motion) -> SegmentedMotion:
+        """Return the problem of physics alone with another motion, from its guessed starts."""
+        problem = replace(self.problem, motion=motion, features=())
+        dynamics = replace(self.dynamics, motion=motion)
+        other = replace(
+            self, problem=problem, dynamics=dynamics, loose=self.loose[: len(motion.states)]
+        )
+        layout = Layout.of(self.record, dynamics, self.criterion, self, self.shares)
+        return replace(other, **layout._asdict())
 
     def over(self, segment: int) -> SegmentedMotion:
         """Return the problem in segments of another length, without washout.

@@ -27,7 +27,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.minimize import LEARNED, Descent
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import theta_block
-from orthaug.models.learners import Bound
+from orthaug.models.learners import Bound, remembers
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
 
@@ -181,25 +181,26 @@ class SimulationTask(ABC):
             progress(iteration, loss * plan.rms**2 / plan.residuals)
 
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
-        free_fit = plan.descend(
-            objective, best.p, solver, report, best.states, ceiling=ceiling, **options
-        )
-        if evidence and not _lowers_loss(free_fit, best.loss):
-            free = plan.descend(
-                objective, best.p, solver.within_limit, report, best.states, ceiling=ceiling
-            )
-            if _lowers_loss(free, best.loss):
-                point, options = free.end.point, options | {"evidence_settled": False}
-                again = plan.descend(
-                    objective, point.p, solver, report, point.states, ceiling=ceiling, **options
-                )
-                free_fit = again if _lowers_loss(again, best.loss) else free_fit
-                spent = {
-                    "iterations": free.iterations + free_fit.iterations,
-                    "seconds": free.seconds + free_fit.seconds,
-                }
-                free_fit = free_fit._replace(**spent)
-        return self._below_physics(free_fit)
+        kept = {"ceiling": ceiling}
+        first = None
+        # The weights of a memory are needed only when others have grown: too late for evidence
+        if not (evidence and remembers(self.bound.learner)):
+            first = plan.descend(objective, best.p, solver, report, best.states, **kept, **options)
+            if not evidence or _lowers_loss(first, best.loss):
+                return self._below_physics(first)
+        free = plan.descend(objective, best.p, solver.within_limit, report, best.states, **kept)
+        if not _lowers_loss(free, best.loss):
+            return self._below_physics(free if first is None else first)
+        point, options = free.end.point, options | {"evidence_settled": False}
+        again = plan.descend(objective, point.p, solver, report, point.states, **kept, **options)
+        chosen = again if _lowers_loss(again, best.loss) else free if first is None else first
+        if chosen is not free:
+            spent = {
+                "iterations": free.iterations + chosen.iterations,
+                "seconds": free.seconds + chosen.seconds,
+            }
+            chosen = chosen._replace(**spent)
+        return self._below_physics(chosen)
 
     def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
         """Return the run, or its best iterate, so that it is not above physics alone.

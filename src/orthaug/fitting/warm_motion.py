@@ -28,6 +28,12 @@ from orthaug.physics.motion_problem import MotionProblem
 _SETTLING = 200  # iterations of the starts, which no step of the descent damps
 
 
+def with_its_memory(model: Model[Any], motion: Motion) -> Motion:
+    """Return the motion with the states that the learner of a model remembers by."""
+    states = () if model.form.separates else model.form.motion.states
+    return replace(motion, states=(*motion.states, *(s for s in states if s.memory)))
+
+
 def check_initial_motion(model: Model[Any], motion: Motion) -> None:
     """Raise InputError for a model that the training of a motion cannot go on from."""
     if model.form.separates:

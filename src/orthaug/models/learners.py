@@ -14,7 +14,7 @@ from functools import cache, cached_property, partial
 from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
-from annotated_types import Ge
+from annotated_types import Ge, Le
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
@@ -22,6 +22,7 @@ from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.models.beyond import BEYOND
+from orthaug.physics.memory import MOST_STATES, check_time_constants
 
 Tree = Any  # a pytree of weight arrays
 
@@ -80,6 +81,9 @@ class MLP:
         beyond: what the correction does beyond the range of its training: "hold", "fade" within a
             quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
             fade in a motion.
+        states: states of its own, by which it remembers the past; 0 for none. Beside equations of
+            motion only (`physics.memory`).
+        time_constants: of these states [s], with which training begins; None to spread them.
 
     Examples:
         >>> MLP(hidden=(8, 8), inputs=("v[k-1]", "x[k-1] - x[k-2]"))
@@ -90,6 +94,8 @@ class MLP:
     activation: Annotated[str, OneOf(ACTIVATIONS)] = "tanh"
     inputs: tuple[str, ...] | None = None
     beyond: Annotated[str, OneOf(BEYOND)] = field(default="auto", repr=False)
+    states: Annotated[int, Ge(0), Le(MOST_STATES)] = field(default=0, repr=False)
+    time_constants: tuple[float, ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.hidden, tuple | list):
@@ -121,6 +127,8 @@ class MLP:
                 f"{has}; at most {MOST_LAYERS} are allowed, since more take minutes to compile."
             )
         check_fields(self)
+        constants = check_time_constants(self.time_constants, self.states)
+        object.__setattr__(self, "time_constants", constants)
 
     def silent(self, tree: Tree) -> Tree:
         """Return the same hidden layers with an output layer of zeros."""
@@ -515,6 +523,11 @@ def _probe(
 def declared(learner: Learner | None) -> Learner:
     """Return a learner itself, and `NoLearner` for None."""
     return NoLearner() if learner is None else learner
+
+
+def remembers(learner: Learner | None) -> bool:
+    """Return True for a learner with states of its own."""
+    return bool(getattr(learner, "states", 0))
 
 
 def learns(learner: Learner | None) -> bool:

@@ -44,6 +44,7 @@ class State:
             one, or None.
         learned: whether the learner is added to this equation.
         unit: of the state, such as "m/s".
+        memory: whether it is a state of the learner, not of the physics (`physics.memory`).
     """
 
     name: str
@@ -51,6 +52,7 @@ class State:
     start: float | str | None = None
     learned: bool = False
     unit: str = ""
+    memory: bool = False
 
     @property
     def from_output(self) -> tuple[str, int] | None:
@@ -354,6 +356,18 @@ class Motion(NotebookView):
         """The numbers of the states and of the outputs that a learner is added to."""
         states = tuple(i for i, state in enumerate(self.states) if state.learned)
         return states, tuple(i for i, output in enumerate(self.outputs) if output.learned)
+
+    @property
+    def memory(self) -> tuple[str, ...]:
+        """Names of the learner's own states, which follow those of the physics."""
+        return tuple(state.name for state in self.states if state.memory)
+
+    @property
+    def without_memory(self) -> Motion:
+        """The motion without the learner's own states."""
+        if not self.memory:
+            return self
+        return replace(self, states=tuple(s for s in self.states if not s.memory))
 
     @property
     def known(self) -> dict[str, float]:

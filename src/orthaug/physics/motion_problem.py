@@ -20,6 +20,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Record
+from orthaug.physics.memory import Memory, add_memory
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.parameters import PhysicalParameter
@@ -222,12 +223,14 @@ def pose_motion(
     motion: Motion,
     learner_inputs: Sequence[str] | None = None,
     output_weights: str | Sequence[float] = "auto",
+    memory: Memory = Memory(),  # noqa: B008  (frozen)
 ) -> MotionProblem:
     """Check record and motion against each other.
 
     Args:
         learner_inputs: expressions of states and inputs that the learner sees; None for all of
             them.
+        memory: states of the learner's own, which are added to the motion.
 
     Raises:
         InputError: other channels, outputs that do not move, learner inputs that cannot be,
@@ -237,6 +240,7 @@ def pose_motion(
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
     motion = motion.sampled(record.sampling_time)
     motion.check_channels(inputs, outputs)
+    motion, learner_inputs = add_memory(motion, learner_inputs, memory, record)
     record.check_measured()
     check_output_weights(output_weights, len(outputs))
     for i, name in enumerate(outputs):

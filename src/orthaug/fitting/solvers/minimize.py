@@ -45,6 +45,7 @@ class CheckpointWriter(Protocol):
         ...
 
 
+@runtime_checkable
 class RunState(Protocol):
     """What the driver reads of the state of a run."""
 
