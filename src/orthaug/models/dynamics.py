@@ -7,7 +7,7 @@ case whose state is the past outputs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -282,7 +282,6 @@ class AutodiffDynamics:
     a learner and without parameters, if nothing else is written.
     """
 
-    bound: Bound = nothing_learned()
     coordinates: Any = Coordinates(())
     entries: tuple[Expression, ...] = ()
     separates = False
@@ -292,6 +291,10 @@ class AutodiffDynamics:
         return numbers
 
     has_range = True
+
+    @cached_property  # a class of dynamics may have a field of this name instead
+    def bound(self) -> Bound:
+        return nothing_learned()
 
     @property
     def learns(self) -> bool:
