@@ -77,6 +77,7 @@ CONCEPTS = {
     "fitting.noise_estimation": "coefficients and orders of noise models",
     "fitting.recursive_storage": "the format of a saved recursive estimate",
     "fitting.segmented_streamed": "segments of rows that remain in a source",
+    "fitting.warm_motion": "training of a motion that goes on from an earlier model",
     "models.devices": "an engine, an entry of the registry",
     "reports.figures": "figures from Python",
     "reports.linear_text": "linear views in words",

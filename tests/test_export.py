@@ -22,7 +22,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
-from orthaug import Baseline, Model, MotionModel, Terms, numpy_step
+from orthaug import Baseline, Model, Terms, numpy_step
 from orthaug.data.expressions import FUNCTIONS, parse, parse_named
 from orthaug.data.regressors import Features
 from orthaug.export import fmu, nodes
@@ -36,6 +36,7 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.moving import MotionDynamics
+from orthaug.models.starts import EstimatedStates
 
 POINTS, STEPS = 1000, 10_000
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")
@@ -91,7 +92,7 @@ def lagged(terms, features, learner, outputs, inputs, constants=None) -> Model:
     )
 
 
-def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionModel:
+def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> Model:
     """A motion with arbitrary weights."""
     motion = motion.sampled(0.1)
     entries = tuple(parse_named(text, motion.known, "feature") for text in features)
@@ -108,7 +109,7 @@ def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionMo
         0.3 * np.ones(values),
     )
     ny = len(motion.outputs)
-    return MotionModel(
+    return Model(
         form=MotionDynamics(motion, entries, bound, 0.1, substeps),
         numbers=numbers,
         outputs=tuple(oa.Channel(output.name, "m") for output in motion.outputs),
@@ -118,8 +119,7 @@ def moving(motion: oa.Motion, features=(), learner=None, substeps=2) -> MotionMo
         largest_output=np.ones(ny),
         deviation=np.ones(ny),
         weight=np.eye(ny),
-        loose=np.ones(len(motion.states)),
-        window=5,
+        starts=EstimatedStates(5, np.ones(len(motion.states))),
     )
 
 
@@ -165,7 +165,7 @@ DISCRETE = oa.Motion.from_equations(
     integrator="discrete",
 )
 LINEAR = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]", unit="m/N"), oa.Term("c", "u[k-2]")]
-MODELS: dict[str, Callable[[], Model | MotionModel]] = {
+MODELS: dict[str, Callable[[], Model]] = {
     "several outputs, every activation": lambda: lagged(
         TWO_OUTPUTS,
         ("y1[k-1]", "gain*u1[k-1]", "u2[k]*y2[k-2]"),
@@ -236,7 +236,7 @@ def limited(model):
 
 @dataclass(frozen=True)
 class Case:
-    model: Model | MotionModel
+    model: Model
     state: np.ndarray
     inputs: np.ndarray
     stepped: tuple[np.ndarray, np.ndarray]
@@ -484,7 +484,7 @@ def test_a_step_in_numpy_alone(name):
         step(np.zeros(99), given.inputs[0])
 
 
-def record_for(model: Model | MotionModel, rows: int = 40) -> oa.Record:
+def record_for(model: Model, rows: int = 40) -> oa.Record:
     rng = np.random.default_rng(1)
     u, y = (rng.normal(size=(rows, len(channels))) for channels in (model.inputs, model.outputs))
     return oa.Record.from_arrays(

@@ -268,7 +268,7 @@ def test_holds_and_discrete_motions_give_the_same_response(pendulum):
 def test_continuous_time_gives_the_sampled_system_back(linear):
     view = oa.linearize(linear.model)[0]
     assert list(view.continuous.dead_time) == pytest.approx([0.0, 2 * STEP])
-    small, dead = observer_form(view.system, linear.model.memory)
+    small, dead = observer_form(view.system, linear.model.filtering[0].memory)
     assert small.states < view.system.states and list(dead) == [0, 2]
     z = np.exp(2j * np.pi * view.bode.frequency[::50] * STEP)
     late = np.stack([z**-count for count in dead], axis=-1)[:, None]

@@ -359,7 +359,10 @@ def test_to_frame(pair):
 
 def test_repr(pair):
     model, record = pair
-    assert repr(model).startswith("Model(orthogonal, θ: a, b, c, learner: MLP(hidden=(3,)")
+    values = ", ".join(
+        f"{name} = {value:.5g}" for name, value in zip("abc", model.theta, strict=True)
+    )
+    assert repr(model).startswith(f"Model(orthogonal, {values}, learner: MLP(hidden=(3,)")
     assert (
         repr(model.simulate(record)) == "Response(simulation of y1, y2, 1 experiment, 30 samples)"
     )
@@ -371,7 +374,8 @@ def test_repr(pair):
     )
     none = CASES["physics alone"]
     fit = estimate(none[0](np.random.default_rng(0), 30), none[1], learner=None)
-    assert repr(fit.model) == "Model(orthogonal, θ: a, b, learner: none)"
+    a, b = fit.theta
+    assert repr(fit.model) == f"Model(orthogonal, a = {a:.5g}, b = {b:.5g}, learner: none)"
 
 
 @pytest.mark.parametrize("horizon", [0, -1, 1.5, True, "1", None])

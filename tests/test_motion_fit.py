@@ -148,7 +148,7 @@ def test_on_its_training_data_a_motion_does_not_extrapolate(
     """What training reached is that of the fitted run; the learner is scaled over that of physics alone."""
     oa.save(fitted.model, tmp_path / "model")
     for model in (fitted.model, oa.load(tmp_path / "model")):
-        assert isinstance(model, oa.MotionModel)
+        assert isinstance(model, oa.Model) and not model.form.separates
         (run,) = model.simulate(data()).trajectories
         assert run.outside is not None and not run.outside.any()
         assert linearization_of(model, data()).outside == 0
@@ -626,3 +626,52 @@ def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     )
     assert (whole.std is None) == ("not_converged" in {warning.code for warning in whole.warnings})
     assert whole.status.loss < short.status.loss
+
+
+def test_a_warm_start_goes_on_from_an_earlier_model(fitted: oa.MotionEstimate, tmp_path) -> None:
+    """A stopped training goes on to at least the end of a long one; a saved model does as a fit does."""
+    solver = oa.LevenbergMarquardt(3)
+    learner = oa.MLP((4,), inputs=("v",))
+    motion, options = spring(learned=True), {"criterion": WHOLE, "blocks": 0, "fallback": False}
+    short = oa.estimate(data(), motion, learner=learner, solver=solver, **options)
+    longer = oa.estimate(data(), motion, learner=None, initial=short, **options)
+    assert longer.learns and longer.model.form.bound == short.model.form.bound
+    np.testing.assert_array_equal(longer.model.numbers.centre, short.model.numbers.centre)
+    assert longer.status.loss < 1.02 * fitted.status.loss < short.status.loss
+    oa.save(fitted.model, tmp_path / "model")
+    for initial in (fitted, oa.load(tmp_path / "model")):
+        again = oa.estimate(data(), motion, initial=initial, solver=solver, **options)
+        assert again.status.loss <= fitted.status.loss * (1 + 1e-6)
+        assert again.values == pytest.approx(fitted.values, rel=0.02)
+
+
+def test_a_warm_start_keeps_what_the_learner_remembers_by() -> None:
+    options = {"criterion": WHOLE, "blocks": 0, "fallback": False}
+    options |= {"solver": oa.LevenbergMarquardt(5)}
+    learner = oa.MLP((3,), inputs=("v",), states=1)
+    first = oa.estimate(data(), spring(learned=True), learner=learner, **options)
+    again = oa.estimate(data(250), spring(learned=True), initial=first, **options)
+    assert again.model.form.motion.states == first.model.form.motion.states
+    assert again.model.form.entries == first.model.form.entries
+
+
+def test_warm_starts_that_fit_no_motion_are_refused(fitted: oa.MotionEstimate) -> None:
+    alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    lagged = oa.estimate(data(), oa.Baseline.from_terms([oa.Term("a", "y[k-1]")]), learner=None)
+    other = spring(learned=True, extra=" - d*x**3", more=[oa.PhysicalParameter("d", 1.0)])
+    for motion, initial, message in (
+        (spring(learned=True), alone, "`initial` is physics alone"),
+        (spring(learned=True), lagged, "`initial` is a lagged model"),
+        (other, fitted, "`initial` has the states x, v and the parameters m, c, k, the motion"),
+        (spring(), fitted, "`initial` has its learner in other equations"),
+        (lagged.problem.baseline, fitted, "`initial` is a motion"),
+    ):
+        with pytest.raises(oa.InputError, match=message):
+            oa.estimate(data(), motion, initial=initial)
+    with pytest.raises(oa.InputError, match="a motion has no `ensemble`: medians"):
+        oa.estimate(data(), spring(), ensemble=True, restarts=2)
+
+
+def test_a_motion_that_would_take_too_much_is_refused_from_python() -> None:
+    with pytest.raises(oa.InputError, match="training a learner of 10000600001 weights would take"):
+        oa.estimate(data(), spring(learned=True), learner=oa.MLP((100_000, 100_000)))

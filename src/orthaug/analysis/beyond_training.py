@@ -20,7 +20,6 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug.analysis.feedback import transitions
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 _FAR = (1e4, 1e7)  # times the states of the run
 _DIRECTIONS = 8
@@ -28,7 +27,7 @@ _SAME = 1e-9  # of the largest entry: more is another matrix
 _LONGEST_STATE = 200
 
 
-def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) -> float | None:
+def radius_beyond(model: Model, states: Matrix, inputs: Matrix) -> float | None:
     """Return the spectral radius of A.
 
     None without a bounded correction, or where A is not one matrix.
@@ -64,7 +63,7 @@ def radius_beyond(model: Model | MotionModel, states: Matrix, inputs: Matrix) ->
     return float(np.abs(np.linalg.eigvals(every[0])).max())
 
 
-def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
+def describe_beyond(model: Model, radius: float | None) -> str:
     """Return a sentence on what the radius says of the free run; empty without a radius."""
     if radius is None:
         return ""
@@ -78,7 +77,7 @@ def describe_beyond(model: Model | MotionModel, radius: float | None) -> str:
     return f"{text}, so the free run is not bounded."
 
 
-def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:
+def _going_on(model: Model, kind: str) -> Model:
     """Return the model whose correction does something else beyond its training."""
     if kind == getattr(model.form, "beyond", kind):
         return model
@@ -88,9 +87,7 @@ def _going_on(model: Model | MotionModel, kind: str) -> Model | MotionModel:
     return replace(model, form=form)
 
 
-def _far_away(
-    model: Model | MotionModel, states: Matrix, inputs: Matrix
-) -> Float[np.ndarray, "m n0 n0"]:
+def _far_away(model: Model, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "m n0 n0"]:
     """Return the derivative of a step at states far away, each at inputs that the run had."""
     random = np.random.default_rng(0)
     reach = np.abs(states).max(axis=0)

@@ -17,7 +17,6 @@ from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import RUNAWAY
 
 # Outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
@@ -29,9 +28,7 @@ _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 Diverging = Callable[[list[float]], np.ndarray]
 
 
-def divergence_scaling(
-    model: Model | MotionModel, record: Record, largest: float = 1024.0
-) -> float | None:
+def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
     """Return the factor on the inputs from which the free run leaves all bounds.
 
     The bounds are 10⁶ times the largest training output.
@@ -142,7 +139,7 @@ def _middle(low: float, high: float) -> float:
 
 
 def _find_diverging(
-    model: Model | MotionModel, record: Record, factors: Sequence[float]
+    model: Model, record: Record, factors: Sequence[float]
 ) -> Bool[np.ndarray, "f"]:
     """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
 

@@ -27,7 +27,6 @@ from orthaug.analysis.visited import (
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 _NO_DERIVATIVE = 1e100  # a derivative beyond is none
@@ -48,7 +47,7 @@ def linearise_points(
 
 
 def transitions(
-    model: Model | MotionModel, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
+    model: Model, states: Float[np.ndarray, "m n0"], inputs: Float[np.ndarray, "m nu"]
 ) -> Float[np.ndarray, "m n0 n0"]:
     """Return A_k at m points; not finite where there is no derivative."""
     n0 = states.shape[1]

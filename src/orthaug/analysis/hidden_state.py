@@ -12,6 +12,7 @@ that it was not fitted to.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,8 +26,9 @@ from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
 from orthaug.fitting.whiteness import whitening_filter
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import MotionDynamics
 
 _MOST_ROWS = 6000
 _VARIABLES, _EQUATIONS = 6, 3  # looked at, at most
@@ -133,7 +135,7 @@ class _Family:
     terms: tuple[MemoryTerm | None, ...]
 
 
-def structure_test(model: Model | MotionModel, record: Record) -> StructureTest | None:
+def structure_test(model: Model, record: Record) -> StructureTest | None:
     """Test what the free run of a model leaves of its training data.
 
     None where the run leaves all bounds or has no slopes, or there are too few rows.
@@ -150,9 +152,7 @@ def structure_test(model: Model | MotionModel, record: Record) -> StructureTest 
     return None if found is None else replace(found, step=float(model.sampling_time))
 
 
-def _fit_physics(
-    model: Model | MotionModel, record: Record
-) -> tuple[Vector, list[LinearRun]] | None:
+def _fit_physics(model: Model, record: Record) -> tuple[Vector, list[LinearRun]] | None:
     """Return parameters of the physics with the least filtered free-run errors, and the runs.
 
     They are found by Gauss-Newton steps.
@@ -221,44 +221,14 @@ def _residual_sum(columns: Matrix, target: Vector) -> float:
     return float(rest @ rest)
 
 
-def _signals(model: Model | MotionModel, run: LinearRun) -> dict[str, Vector]:
-    """Return the signals that terms may depend on.
-
-    They are each channel of the regressor and its velocity, or states and inputs.
-    """
-    form: Any = model.form
-    if isinstance(model, MotionModel):
-        names = (*model.form.motion.names_of_states, *model.form.motion.inputs)
-        found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
-        seen = form.seen(run.states.T, run.inputs.T, np)
-        found |= {
-            str(entry): row
-            for entry, row in zip(form.features, seen, strict=False)
-            if str(entry) not in found
-        }
-    else:
-        x, layout = form.regressor(run.states.T, run.rows.T, np), form.layout
-        found = {}
-        for channel in dict.fromkeys(lag.channel for lag in layout):
-            lags = sorted(lag for lag in layout if lag.channel == channel)
-            first, *others = (x[layout.index(lag)] for lag in lags)
-            found[str(lags[0])] = first
-            if others and channel in form.outputs:
-                found[f"{lags[0]} - {lags[1]}"] = first - others[0]
+def _signals(model: Model, run: LinearRun) -> dict[str, Vector]:
+    """Return the signals that terms may depend on, as far as they move."""
     moving = {
-        name: row for name, row in found.items() if np.isfinite(row).all() and np.ptp(row) > 0
+        name: row
+        for name, row in _equations(model).signals(run).items()
+        if np.isfinite(row).all() and np.ptp(row) > 0
     }
     return dict(list(moving.items())[:_VARIABLES])
-
-
-def _features(model: Model | MotionModel, run: LinearRun) -> Matrix:
-    """Return the learner's inputs along the run, (T, nz)."""
-    form: Any = model.form
-    if isinstance(model, MotionModel):
-        return np.asarray(form.seen(run.states.T, run.inputs.T, np)).T
-    return np.asarray(
-        form.features.evaluate(form.regressor(run.states.T, run.rows.T, np).T, form.layout, np)
-    )
 
 
 def _lags_read(model: Any, run: LinearRun) -> Matrix:
@@ -268,10 +238,64 @@ def _lags_read(model: Any, run: LinearRun) -> Matrix:
     return np.asarray(x)[[form.layout.index(lag) for lag in form.features.lags]].T
 
 
-def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
-    """Return the equations that may lack a term: outputs, or states with parameter or learner."""
-    if isinstance(model, MotionModel):
-        motion = model.form.motion
+@dataclass(frozen=True)
+class _OfOutputs:
+    """The equations of a lagged model: its outputs."""
+
+    form: LaggedDynamics
+
+    def signals(self, run: LinearRun) -> dict[str, Vector]:
+        """Return each channel of the regressor, and its velocity."""
+        form, found = self.form, {}
+        x, layout = form.regressor(run.states.T, run.rows.T, np), form.layout
+        for channel in dict.fromkeys(lag.channel for lag in layout):
+            lags = sorted(lag for lag in layout if lag.channel == channel)
+            first, *others = (x[layout.index(lag)] for lag in lags)
+            found[str(lags[0])] = first
+            if others and channel in form.outputs:
+                found[f"{lags[0]} - {lags[1]}"] = first - others[0]
+        return found
+
+    @property
+    def doubted(self) -> tuple[tuple[int, str], ...]:
+        """Place and name of the equations that may lack a term."""
+        return tuple(enumerate(self.form.outputs))[:_EQUATIONS]
+
+    @property
+    def learned(self) -> list[int]:
+        """Places of the equations to which a function of the learner's inputs may be added."""
+        return [place for place, _ in self.doubted]
+
+    def enter(
+        self, run: LinearRun, place: int, columns: Matrix, step: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return by what signals (T, k) that are added to an equation move state and outputs."""
+        (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
+        into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
+        into_output[:, place] = columns
+        if n0:
+            into_state[:, place] = columns
+        return into_state, into_output
+
+
+@dataclass(frozen=True)
+class _OfStates:
+    """The equations of a motion: those of its states."""
+
+    form: MotionDynamics
+
+    def signals(self, run: LinearRun) -> dict[str, Vector]:
+        """Return states and inputs, and what the learner sees beside them."""
+        form = self.form
+        names = (*form.motion.names_of_states, *form.motion.inputs)
+        found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
+        seen = zip(form.features, form.features_at(run.states, run.rows).T, strict=False)
+        return found | {str(entry): row for entry, row in seen if str(entry) not in found}
+
+    @property
+    def doubted(self) -> tuple[tuple[int, str], ...]:
+        """Place and name of the equations with a parameter or the learner."""
+        motion = self.form.motion
         names, places = motion.names_of_states, set(motion.learned[0])
         places |= {
             i
@@ -279,36 +303,49 @@ def _equations(model: Model | MotionModel) -> tuple[tuple[int, str], ...]:
             if motion.functions is not None or motion.parameters_in(name)
         }
         return tuple((i, names[i]) for i in sorted(places))[:_EQUATIONS]
-    return tuple(enumerate(model.form.outputs))[:_EQUATIONS]
 
+    @property
+    def learned(self) -> list[int]:
+        return list(self.form.motion.learned[0])
 
-def _respond(model: Model | MotionModel, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
-    """Compute how the outputs follow signals (T, k) that are added to an equation, (T, ny, k)."""
-    (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
-    into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
-    if not isinstance(model, MotionModel):
-        into_output[:, place] = columns
-        if n0:
+    def enter(
+        self, run: LinearRun, place: int, columns: Matrix, step: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
+        into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
+        if self.form.motion.scheme.discrete:
             into_state[:, place] = columns
-    elif model.form.motion.scheme.discrete:
-        into_state[:, place] = columns
-    else:
-        half = model.sampling_time / 2
-        into_state += half * run.to_state[:, :, place, None] * columns[:, None]
-        into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
-    return run.respond(into_state, into_output, np.zeros((n0, k)))
+        else:
+            half = step / 2
+            into_state += half * run.to_state[:, :, place, None] * columns[:, None]
+            into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
+        return into_state, into_output
 
 
-def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.ndarray]:
+_EQUATIONS_OF: dict[type, Callable[[Any], _OfOutputs | _OfStates]] = {
+    LaggedDynamics: _OfOutputs,
+    MotionDynamics: _OfStates,
+}
+
+
+def _equations(model: Model) -> _OfOutputs | _OfStates:
+    """Return the equations of a model to which terms may be added."""
+    return _EQUATIONS_OF[type(model.form)](model.form)
+
+
+def _respond(model: Model, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
+    """Compute how the outputs follow signals (T, k) that are added to an equation, (T, ny, k)."""
+    entering = _equations(model).enter(run, place, columns, model.sampling_time)
+    return run.respond(*entering, np.zeros((run.states.shape[1], columns.shape[1])))
+
+
+def _base_columns(model: Model, runs: list[LinearRun]) -> list[np.ndarray]:
     """Return the model's own columns of every run (T, ny, k).
 
     They are starts, parameters, and functions of the learner's inputs.
     """
     learned = _learned_functions(model, runs)
-    places = [i for i, _ in _equations(model)]
-    if isinstance(model, MotionModel):
-        places = list(model.form.motion.learned[0])
-    found = []
+    places, found = _equations(model).learned, []
     for j, (run, functions) in enumerate(zip(runs, learned, strict=True)):
         starts = run.starts()
         own = np.zeros((*starts.shape[:2], starts.shape[2] * len(runs)))
@@ -318,12 +355,12 @@ def _base_columns(model: Model | MotionModel, runs: list[LinearRun]) -> list[np.
     return found
 
 
-def _learned_functions(model: Model | MotionModel, runs: list[LinearRun]) -> list[Matrix]:
+def _learned_functions(model: Model, runs: list[LinearRun]) -> list[Matrix]:
     """Return functions (T, k) of what the learner sees along every run, k = 0 without a learner.
 
     Many terms are functions of few lags: they are taken as they are, beside bends of these lags.
     """
-    features = [_features(model, run) for run in runs]
+    features = [model.form.features_at(run.states, run.rows) for run in runs]
     count = features[0].shape[1]
     if count > _MULTIPLIED and getattr(model.form.features, "linear", False):
         lags = [_lags_read(model, run) for run in runs]
@@ -373,9 +410,7 @@ def _static(values: Vector, size: float) -> list[Vector]:
     return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
 
 
-def _added_columns(
-    model: Model | MotionModel, runs: list[LinearRun]
-) -> tuple[list[_Family], list[np.ndarray]]:
+def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
     """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
     step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
@@ -386,7 +421,7 @@ def _added_columns(
         terms = memory_terms(name, joined, step)
         kinds = [("static", (None,) * _STATIC)]
         kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
-        for place, equation in _equations(model):
+        for place, equation in _equations(model).doubted:
             families += [_Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
                 values = _static(own[name], size) + [

@@ -17,13 +17,12 @@ from jaxtyping import Float
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.analysis.feedback import by_differences
-from orthaug.fitting.segmented_motion import LOOSE
 from orthaug.models.dynamics import Numbers
+from orthaug.models.filters import LaggedFilter
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import MotionDynamics
-from orthaug.models.stepping import Memory, step_inputs, step_lagged
+from orthaug.models.stepping import Memory, step_inputs
 
 _WIDTH = 1e-3  # of differences, in sizes: bears a learner in single precision
 
@@ -37,6 +36,21 @@ class LaggedStep:
 
     ends = 1  # how many instants' inputs a step reads
     continuous = False  # whether there are derivatives in time
+    smooth = False  # whether inputs run on a spline between samples
+
+    @classmethod
+    def of(cls, model: Model[LaggedDynamics]) -> LaggedStep:
+        """Return the step of a lagged model."""
+        return cls(model.form, Memory.of(model.form.layout, model.form.outputs, model.step_inputs))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of states that are no channels."""
+        return {}
+
+    def sizes(self, model: Model[LaggedDynamics]) -> Vector:
+        """Return the sizes of the unknowns of rest over the training data."""
+        return np.asarray(model.largest_output, dtype=float)
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -62,7 +76,10 @@ class LaggedStep:
 
     def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
         """Return the next state and the outputs."""
-        return step_lagged(self.form, numbers, self.memory, state, inputs)
+        following, parts = LaggedFilter(self.form, self.memory).step(numbers, state, inputs)
+        return following, parts.total
+
+    field = advance  # there are no equations in time
 
     def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
         """Return the residual of rest, zero at rest, and the outputs."""
@@ -86,6 +103,26 @@ class MotionStep:
     """As `LaggedStep`, of a motion; it rests where no state changes."""
 
     form: MotionDynamics
+    smooth: bool = False
+
+    memory = None
+
+    @classmethod
+    def of(cls, model: Model[MotionDynamics]) -> MotionStep:
+        """Return the step of a motion, with a spline through the record as straight lines."""
+        form, smooth = model.form, False
+        if form.motion.hold == "spline":
+            smooth = bool(model.inputs) and not form.motion.scheme.discrete
+            form = replace(form, motion=replace(form.motion, hold="first-order"))
+        step_inputs(form)  # whatever else has no step is refused there
+        return cls(form, smooth)
+
+    @property
+    def units(self) -> dict[str, str]:
+        return {state.name: state.unit for state in self.form.motion.states}
+
+    def sizes(self, model: Model[MotionDynamics]) -> Vector:
+        return np.asarray(model.filtering[2], dtype=float)
 
     @property
     def continuous(self) -> bool:
@@ -132,28 +169,23 @@ class MotionStep:
 
 
 Step = LaggedStep | MotionStep
+_STEPS: dict[type, Callable[[Any], Step]] = {
+    LaggedDynamics: LaggedStep.of,
+    MotionDynamics: MotionStep.of,
+}
 
 
-def step_of(model: Model | MotionModel) -> Step:
+def step_of(model: Model) -> Step:
     """Return the step to linearise.
 
     A spline through the record is replaced by straight lines between samples.
     """
-    if isinstance(model, Model):
-        return LaggedStep(model.form, model.memory)
-    form = model.form
-    if form.motion.hold == "spline":
-        form = replace(form, motion=replace(form.motion, hold="first-order"))
-    step_inputs(form)  # whatever else has no step is refused there
-    return MotionStep(form)
+    return _STEPS[type(model.form)](model)
 
 
-def sizes_of(model: Model | MotionModel) -> Vector:
+def sizes_of(model: Model) -> Vector:
     """Return the sizes of the unknowns of rest over the training data."""
-    if isinstance(model, Model):
-        size = np.asarray(model.largest_output, dtype=float)
-    else:
-        size = np.asarray(model.loose, dtype=float) / LOOSE
+    size = step_of(model).sizes(model)
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 
@@ -201,7 +233,7 @@ def unrest_along(
 def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]:
     """Return a step, or the field, as a function of state and inputs in one vector."""
     n = len(step.states)
-    function = step.field if field and isinstance(step, MotionStep) else step.advance
+    function = step.field if field else step.advance
     return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
 
 

@@ -12,7 +12,6 @@ from orthaug._base.checks import Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.linear_steps import (
-    MotionStep,
     difference_widths,
     one_sided,
     slope_along,
@@ -28,7 +27,6 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 _POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
@@ -47,7 +45,7 @@ class _Spread(NamedTuple):
 
 
 def linearize(
-    model: Model | MotionModel | Estimate | MotionEstimate,
+    model: Model | Estimate | MotionEstimate,
     at: str | Mapping[str, float] | None = None,
     record: Record | None = None,
     *,
@@ -79,15 +77,15 @@ def linearize(
         >>> round(linearize(oa.estimate(record, physics, learner=None))[0].poles[0].z.real, 6)
         0.5
     """
-    kinds = Model | MotionModel | Estimate | MotionEstimate
+    kinds = Model | Estimate | MotionEstimate
     check_type(model, kinds, "model", "a fitted model, or what estimate returns")
     check_type(record, Record | None, "record", "a Record, or None")
     check_choice(continuous, METHODS, "`continuous`")
-    fit = None if isinstance(model, Model | MotionModel) else model
+    fit = None if isinstance(model, Model) else model
     if fit is not None:
         record = fit.problem.record if record is None else record
         model = fit.model
-    assert isinstance(model, Model | MotionModel)
+    assert isinstance(model, Model)
     if record is not None:
         record = model.fitting(record, need_outputs=False)
     frequency = _frequencies(frequencies, model.sampling_time)
@@ -100,7 +98,7 @@ def linearize(
     points, warnings = operating_points(search)
     spread, of_spread = _spread(model, fit)
     warnings += of_spread
-    if _smooth(model):
+    if step.smooth:
         text = (
             "a spline through the record has no step: the sampled system is that of straight "
             "lines between samples, the frequency response that of the equations."
@@ -140,7 +138,7 @@ def _frequencies(given: Any, step: float) -> Vector | None:
     return found
 
 
-def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[Warning]]:
+def _spread(model: Model, fit: Any) -> tuple[_Spread | None, list[Warning]]:
     """Return the covariance to take intervals from, and what is to be said of it."""
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
@@ -153,7 +151,7 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
         root = joint.root()
         if np.isfinite(root).all():
             return _Spread(root, model.statistics.freedom, False), []
-    covariance = None if fit is None or isinstance(model, MotionModel) else fit.covariance
+    covariance = None if fit is None else fit.covariance
     if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
         values, vectors = np.linalg.eigh(covariance)
         text = (
@@ -169,7 +167,7 @@ def _spread(model: Model | MotionModel, fit: Any) -> tuple[_Spread | None, list[
 
 
 def _view(
-    model: Model | MotionModel,
+    model: Model,
     search: Search,
     point: OperatingPoint,
     spread: _Spread | None,
@@ -192,9 +190,7 @@ def _view(
         own = _system(search, point, spread, None)
         found: Continuous | str = Continuous(own, np.zeros(len(step.inputs)), "equations", names)
     else:
-        found = convert_to_continuous(
-            sampled, method, None if isinstance(step, MotionStep) else step.memory, names
-        )
+        found = convert_to_continuous(sampled, method, step.memory, names)
     poles = poles_of(sampled, own, freedom)
     if any(
         pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1]
@@ -206,14 +202,13 @@ def _view(
         )
         warnings.append(Warning("stability_not_sure", text))
     gain, gain_ci95 = gain_of(sampled, freedom)
-    bode, smooth = None, _smooth(model)
+    bode, smooth = None, step.smooth
     if step.inputs:
         grid = _grid(poles, model.sampling_time) if frequency is None else frequency
         bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
         warnings += _rough(bode)
     units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-    if isinstance(model, MotionModel):
-        units |= {state.name: state.unit for state in model.form.motion.states}
+    units |= step.units
     outputs = tuple(channel.name for channel in model.outputs)
     modes = sampled.modes.at_zero
     seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)
@@ -252,13 +247,6 @@ def _system(
         )
         moved = np.where(np.isfinite(moved), moved, 0.0)
     return System(matrix, len(step.states), time, moved)
-
-
-def _smooth(model: Model | MotionModel) -> bool:
-    """Return whether inputs run on a spline between samples."""
-    if not isinstance(model, MotionModel) or not model.inputs:
-        return False
-    return model.form.motion.hold == "spline" and not model.form.motion.scheme.discrete
 
 
 def _without_next(system: System) -> System:

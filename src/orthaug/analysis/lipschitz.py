@@ -76,7 +76,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     Raises:
         InputError: a record that does not fit the model, or has no outputs.
     """
-    if not isinstance(form := model.form, LaggedDynamics):
+    if not (form := model.form).separates:
         return None
     stacked, every, y_scale = _measured_regressors(model, record, x)
     some = even_indices(len(every), MOST_STEPS)

@@ -21,7 +21,7 @@ from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
 from orthaug.analysis.boundedness import divergence_scaling, margin
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
@@ -69,7 +69,7 @@ class MotionStability:
 
 
 def motion_stability(
-    model: MotionModel, x: Matrix, u: Matrix, record: Record | None = None
+    model: Model[MotionDynamics], x: Matrix, u: Matrix, record: Record | None = None
 ) -> MotionStability:
     """Return the stability over states (N, nx) and inputs (N, nu) of a run, where these are finite.
 
@@ -89,14 +89,14 @@ def motion_stability(
     return replace(checks, text=text, warnings=warnings, **found)
 
 
-def _of_steps(model: MotionModel, record: Record) -> Matrix:
+def _of_steps(model: Model[MotionDynamics], record: Record) -> Matrix:
     """Return the inputs of the steps of a record, (T, nu)."""
     return np.concatenate(
         [model.form.inputs(experiment, record) for experiment in record.experiments]
     )
 
 
-def _of_modes(model: MotionModel, x: Matrix, u: Matrix) -> MotionStability:
+def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStability:
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
@@ -141,7 +141,7 @@ def _without_growth(found: Modes) -> str:
     return " ".join(sentences)
 
 
-def modes(model: MotionModel, x: Matrix, u: Matrix) -> Modes | None:
+def modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> Modes | None:
     """Return the eigenvalues over at most 2000 points, spread evenly.
 
     None where no derivative is finite.

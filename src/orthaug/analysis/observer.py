@@ -25,7 +25,6 @@ from orthaug.models.kalman import (
     spread_of,
 )
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.on_records import trajectory
 from orthaug.models.response import BAND, Response, Trajectory
 from orthaug.models.stepping import checked_row, one_experiment
@@ -53,7 +52,7 @@ class Observer:
     def __post_init__(self) -> None:
         check_type(
             self.model,
-            Model | MotionModel | Estimate | MotionEstimate,
+            Model | Estimate | MotionEstimate,
             "model",
             "a fitted model or a fit",
         )

@@ -21,7 +21,6 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.kalman import Noise, log_likelihood
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
 BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
@@ -34,7 +33,7 @@ _STEP = -1.5  # of the search at first, in e-folds
 _LARGE = 1e12
 
 
-def by_verdict(model: Model | MotionModel, verdict: str | None = None) -> Noise:
+def by_verdict(model: Model, verdict: str | None = None) -> Noise:
     """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
     Those are noises by the likelihood of its training data, else those of its verdict.
@@ -60,7 +59,7 @@ def _is_known(noise: Matrix | None) -> TypeGuard[Matrix]:
     return noise is not None and bool(np.all(np.diag(noise) > 0))
 
 
-def with_share(model: Model | MotionModel, noise: Matrix, share: float) -> Noise:
+def with_share(model: Model, noise: Matrix, share: float) -> Noise:
     """Return disturbances that make up a share of a free run's variance `noise`, about the origin.
 
     The sensors make the rest.
@@ -116,9 +115,7 @@ def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
     return most_likely(model, by_verdict(model, verdict), fit.problem.record, _KEPT_ROWS)
 
 
-def most_likely(
-    model: Model | MotionModel, begun: Noise, record: Record, rows: int = _TUNED_ROWS
-) -> Noise:
+def most_likely(model: Model, begun: Noise, record: Record, rows: int = _TUNED_ROWS) -> Noise:
     """Return the noises of most likelihood for a record among `(q Q, r R)`, over its first rows.
 
     Where an R or Q that is zero begins, it stays zero.

@@ -18,7 +18,6 @@ from orthaug._base.errors import InputError, Warning, show
 from orthaug.analysis.linear_steps import Step, at_rest, difference_widths, sizes_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 _STARTS = 32  # points of a Halton sequence in the box of the training data, beside the middle
 _SOLVED = 1e-9  # of what is zero at rest over the starts
@@ -127,7 +126,7 @@ class Search:
     def of(
         cls,
         step: Step,
-        model: Model | MotionModel,
+        model: Model,
         outputs: Sequence[str],
         at: Mapping[str, float],
         held: Vector,

@@ -19,7 +19,6 @@ from orthaug._base.jax import jax, jnp, padded_length
 from orthaug.data.record import Record
 from orthaug.fitting.whiteness import LARGEST
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +67,7 @@ class LinearRun:
         return self.respond(self.theta_to_state, self.theta_to_output, np.zeros((n0, nt)))
 
 
-def linear_runs(
-    model: Model | MotionModel, record: Record, most: int, theta: Vector
-) -> list[LinearRun] | None:
+def linear_runs(model: Model, record: Record, most: int, theta: Vector) -> list[LinearRun] | None:
     """Linearise the free run over a record; None where it leaves all bounds or has no slopes.
 
     Args:

@@ -27,7 +27,6 @@ from orthaug.fitting.held_out import (
 )
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 # Of the training range: an excursion that is reported, and one that counts on any row
@@ -102,7 +101,7 @@ class Verdict:
 
 
 def free_run_error(
-    model: Model | MotionModel,
+    model: Model,
     record: Record,
     skip: int | tuple[int, ...] = 0,
     unit: Any = None,
@@ -130,8 +129,8 @@ def score_trial(
     where: str,
     record: Record,
     skip: tuple[int, ...],
-    alone: Model | MotionModel,
-    model: Model | MotionModel,
+    alone: Model,
+    model: Model,
     *,
     alone_response: Response | None = None,
     response: Response | None = None,

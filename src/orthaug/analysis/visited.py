@@ -13,7 +13,6 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Dynamics
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.response import Response
 
 Describe = Callable[[Vector, Vector], dict[str, float]]
@@ -148,7 +147,7 @@ class RunSample:
     diverged: tuple[str, ...] = ()
 
 
-def usable(model: Model | MotionModel, record: Record) -> Record:
+def usable(model: Model, record: Record) -> Record:
     """Return the record's channels in the model's order.
 
     Raises:

@@ -27,7 +27,6 @@ from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.reports import plots
 from orthaug.reports.result import CompareResult, RowResult, parameter_rows
 
@@ -152,7 +151,7 @@ def compare_report(comparison: Comparison) -> str:
     )
 
 
-def _load_matching(path: Path, job: Job) -> Model | MotionModel:
+def _load_matching(path: Path, job: Job) -> Model:
     """Return a saved model that fits the job's data."""
     model = storage.load(path)
     record = job.problem.record
@@ -182,7 +181,7 @@ def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
     return _row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
 
 
-def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
+def _saved_row(name: str, model: Model, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
     return _row_of(
@@ -191,7 +190,7 @@ def _saved_row(name: str, model: Model | MotionModel, job: Job) -> RowResult:
 
 
 def _row_of(
-    name: str, model: Model | MotionModel, scores: Any, warnings: Sequence[Any], **content: Any
+    name: str, model: Model, scores: Any, warnings: Sequence[Any], **content: Any
 ) -> RowResult:
     """Return a row of the table; keys that `content` lacks are null."""
     own = {"name": name, "weights": model.form.bound.size}

@@ -16,7 +16,6 @@ from orthaug.data.record import Record
 if TYPE_CHECKING:
     from orthaug.analysis.linear_view import Linearization
     from orthaug.models.model import Model
-    from orthaug.models.motion_model import MotionModel
 
 _FIGURES = (".png", ".pdf", ".svg")
 
@@ -44,7 +43,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
                 raise InputError(f"{out}: holds {file}, which is read; give another folder.")
 
 
-def open_linear(model: Path, data: Path | None) -> tuple[Model | MotionModel, Record | None]:
+def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None]:
     """Return the model, and the record of a data file or of the training data of a spec.
 
     Raises:

@@ -50,14 +50,12 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
     with parquet_file(data) as file:
         if file.metadata.num_rows <= LONG:
             return None
-    from orthaug.models.model import Model
     from orthaug.models.storage import load
 
     loaded = load(model)
     check_instants(loaded, data)
-    if not isinstance(loaded, Model) or len(held_outputs(loaded, data, reading)) < len(
-        loaded.outputs
-    ):
+    measured = held_outputs(loaded, data, reading)
+    if not loaded.form.separates or len(measured) < len(loaded.outputs):
         return None
     source = open_parquet(
         [data],

@@ -15,7 +15,7 @@ from orthaug.commands.motion import MotionPhysics
 from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import Spec, load_spec, spec_error
 from orthaug.data.record import check_channels
-from orthaug.fitting.rules import check_cost, check_scored
+from orthaug.fitting.rules import check_scored, check_sizes
 from orthaug.inference.kinds import MeasurePlace
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
@@ -112,13 +112,6 @@ def _check_sizes(spec: Spec, problem: Any, engine: Any) -> None:
         check_scored(spec.declared_criterion(), longest)
     except KeyedError as error:
         raise spec_error(error) from None
-    sizes: dict[str, Any] = {
-        "rows": problem.count,
-        "features": problem.feature_count,
-        "outputs": problem.learner_outputs,
-        "held": problem.rows_in_memory,
-    }
     runs, iterations = spec.runs(linear=problem.linear), spec.declared_solver().iterations
-    check_cost(
-        spec.declared_learner(), **sizes, iterations=iterations, runs=runs, room=engine.room()
-    )
+    learner = spec.declared_learner()
+    check_sizes(problem, learner, iterations=iterations, runs=runs, room=engine.room())

@@ -26,7 +26,6 @@ from orthaug.reports.explanation import ExplainResult
 if TYPE_CHECKING:
     from orthaug.analysis.observed import Consistency
     from orthaug.models.model import Model
-    from orthaug.models.motion_model import MotionModel
     from orthaug.models.response import Response
 
 
@@ -75,7 +74,7 @@ class ReadOptions:
 class ModelOnData:
     """A saved model with the record of a data file, and the number of rows read."""
 
-    model: Model | MotionModel
+    model: Model
     record: Record
     source: Path
     rows: int = 0
@@ -207,7 +206,7 @@ def open_run(
 
 
 def record_for(
-    model: Model | MotionModel, data: Path, outputs: Sequence[Channel], reading: ReadOptions
+    model: Model, data: Path, outputs: Sequence[Channel], reading: ReadOptions
 ) -> Record:
     """Return a model's inputs, and some outputs, from a file.
 
@@ -231,7 +230,7 @@ def record_for(
     )
 
 
-def check_instants(model: Model | MotionModel, data: Path) -> None:
+def check_instants(model: Model, data: Path) -> None:
     """Raise InputError where the file cannot give the instants that the model needs."""
     steps = [done.named for done in model.prepared if done.step in SAMPLING]
     if steps:
@@ -242,7 +241,7 @@ def check_instants(model: Model | MotionModel, data: Path) -> None:
         )
 
 
-def held_outputs(model: Model | MotionModel, data: Path, reading: ReadOptions) -> list[Channel]:
+def held_outputs(model: Model, data: Path, reading: ReadOptions) -> list[Channel]:
     """Return the outputs that a file has columns for."""
     return [
         c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))
@@ -253,9 +252,7 @@ _RAW = "The rows of this file are taken as they are; --prepare does the same to 
 _DETRENDED = " Detrended signals are deviations from their trend in each file."
 
 
-def prepared_notes(
-    model: Model | MotionModel, record: Record | None = None, what: str = _RAW
-) -> tuple[str, ...]:
+def prepared_notes(model: Model, record: Record | None = None, what: str = _RAW) -> tuple[str, ...]:
     """Return notes on a model whose training data were prepared.
 
     Args:

@@ -28,8 +28,9 @@ from orthaug.data.tables import check_readable
 from orthaug.fitting.any_fit import STD_KINDS, WITHHELD
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import MotionDynamics
 from orthaug.reports.result import MeasureResult, SplitResult, parameter_rows
 
 _UNKNOWN = Warning("no_statistics", "no standard errors: training left no statistics.")
@@ -169,7 +170,7 @@ def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
         InputError: a θ at a bound, a measure that does not fit the model, other data than those of
             its training.
     """
-    found = _SPLITS[type(opened.model)](opened.model, opened.record, measure, opened.warnings)
+    found = _SPLITS[type(opened.model.form)](opened.model, opened.record, measure, opened.warnings)
     if not opened.withheld:
         return found
     rows = [
@@ -180,7 +181,7 @@ def split_model(opened: ModelOnData, measure: Measure) -> SplitResult:
 
 
 def _split_lagged(
-    model: Model, record: Record, measure: Measure, warnings: Sequence[Warning]
+    model: Model[LaggedDynamics], record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.inference.covariance import interval
     from orthaug.inference.splitting import split_by_measure
@@ -211,7 +212,7 @@ def _split_lagged(
 
 
 def _split_motion(
-    model: MotionModel, record: Record, measure: Measure, warnings: Sequence[Warning]
+    model: Model[MotionDynamics], record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
     from orthaug.fitting.motion_estimation import reopen_estimate
 
@@ -230,4 +231,7 @@ def _split_motion(
     )
 
 
-_SPLITS: dict[type, Callable[..., SplitResult]] = {Model: _split_lagged, MotionModel: _split_motion}
+_SPLITS: dict[type, Callable[..., SplitResult]] = {
+    LaggedDynamics: _split_lagged,
+    MotionDynamics: _split_motion,
+}

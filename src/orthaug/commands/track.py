@@ -61,7 +61,6 @@ def open_track(
         InputError: no model, no data, a motion, training files missing where no state is given, or
             given beside one.
     """
-    from orthaug.models.model import Model
     from orthaug.models.storage import load
 
     if not data:
@@ -79,7 +78,7 @@ def open_track(
     for path in data:
         check_readable(path)
     loaded = load(model)
-    if not isinstance(loaded, Model):
+    if not loaded.form.separates:
         from orthaug.fitting.recursive_rows import MOTION
 
         raise InputError(f"{model}: {MOTION}")

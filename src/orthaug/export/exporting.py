@@ -24,7 +24,6 @@ from orthaug.export.lowering import program_of
 from orthaug.export.program import WRITTEN, Program, Signal, Vectors
 from orthaug.models import storage
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 
 _LONGEST = 40  # characters of a name, which is put in front of others
 _TAKEN = (
@@ -78,7 +77,7 @@ def check_export(to: str, folder: Path, name: str = "model", *, force: bool = Fa
 
 
 def export(
-    model: Model | MotionModel,
+    model: Model,
     folder: str | Path,
     to: str,
     *,
@@ -110,7 +109,7 @@ def export(
         ...     sorted(file.name for file in Path(folder, "code").iterdir())
         ['README.md', 'check.c', 'manifest.json', 'plant.c', 'plant.h', 'vectors.csv']
     """
-    check_type(model, Model | MotionModel, "model", "a fitted model")
+    check_type(model, Model, "model", "a fitted model")
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
     check_export(to, folder, name, force=force)
@@ -220,7 +219,7 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
 def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
     """Return initial states: in the middle of the learner's features, zero, one."""
     zero = np.zeros(len(program.states))
-    entries = model.form.features.entries if isinstance(model, Model) else model.form.features
+    entries = model.form.entries
     centres = {
         entry.text.partition("[")[0]: c
         for entry, c in zip(entries, model.numbers.centre, strict=True)
@@ -235,7 +234,7 @@ def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
 def _range(model: Any, program: Program) -> tuple[Any, Any]:
     """Return middle and half width of each input in the learner's features; 0 and 1 elsewhere."""
     middle, reach = np.zeros(program.held), np.ones(program.held)
-    entries = model.form.features.entries if isinstance(model, Model) else model.form.features
+    entries = model.form.entries
     names = [signal.name for signal in program.inputs[: program.held]]
     for entry, centre, width in zip(
         entries, model.numbers.centre, model.numbers.halfwidth, strict=True

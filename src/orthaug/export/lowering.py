@@ -21,7 +21,8 @@ from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.model import Model
 from orthaug.models.motion_field import MotionField
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.stepping import Memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,19 +101,19 @@ _OWN_FUNCTION = (
 )
 
 
-def program_of(model: Model | MotionModel, name: str = "model", digest: str = "") -> Program:
+def program_of(model: Model, name: str = "model", digest: str = "") -> Program:
     """Return the step of a model in the intermediate form.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
             the whole record.
     """
-    check_type(model, Model | MotionModel, "model", "a fitted model")
+    check_type(model, Model, "model", "a fitted model")
     numbers = model.numbers
     if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
         raise InputError("the model holds numbers that are not finite; fit it again.")
     prepared = ", ".join(done.named for done in model.prepared if done.step not in MENDING)
-    return replace(_LOWERED[type(model)](model, name, digest), preparation=prepared)
+    return replace(_LOWERED[type(model.form)](model, name, digest), preparation=prepared)
 
 
 class _Constants:
@@ -144,7 +145,8 @@ class _Constants:
 
 
 def _lower_lagged(model: Model, name: str, digest: str) -> Program:
-    form, numbers, memory = model.form, model.numbers, model.memory
+    form, numbers = model.form, model.numbers
+    memory = Memory.of(form.layout, form.outputs, model.step_inputs)
     if form.baseline.function is not None:
         raise InputError(f"the physics {_OWN_FUNCTION}.")
     if numbers.tilt is not None:
@@ -229,7 +231,7 @@ def _weighted_terms(
     return sums, corrections
 
 
-def _motion_names(model: MotionModel, constants: _Constants) -> dict[str, Node]:
+def _motion_names(model: Model[MotionDynamics], constants: _Constants) -> dict[str, Node]:
     """Return the meaning of the names of constants, parameters, states and inputs."""
     form, numbers, motion = model.form, model.numbers, model.form.motion
     values = np.asarray(
@@ -262,7 +264,7 @@ def _with_correction(
     return apply("add", physics, correction if held is None else held.fade(correction))
 
 
-def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, Node]:
+def _split_parameters(model: Model[MotionDynamics], constants: _Constants) -> dict[str, Node]:
     """Return the estimated parameters, with which the physics continues beyond the data."""
     motion = model.form.motion
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
@@ -274,7 +276,7 @@ def _split_parameters(model: MotionModel, constants: _Constants) -> dict[str, No
     }
 
 
-def _motion(model: MotionModel, name: str, digest: str) -> Program:
+def _motion(model: Model[MotionDynamics], name: str, digest: str) -> Program:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     if motion.functions is not None:
         raise InputError(f"the motion {_OWN_FUNCTION}.")
@@ -348,7 +350,11 @@ def _motion(model: MotionModel, name: str, digest: str) -> Program:
 
 
 def _moving_program(
-    model: MotionModel, blocks: Mapping[str, Block], constants: _Constants, name: str, digest: str
+    model: Model[MotionDynamics],
+    blocks: Mapping[str, Block],
+    constants: _Constants,
+    name: str,
+    digest: str,
 ) -> Program:
     motion, step_inputs = model.form.motion, model.step_inputs
     units = {channel.name: channel.unit for channel in model.inputs}
@@ -371,8 +377,8 @@ def _moving_program(
 
 
 _LOWERED: dict[type, Callable[[Any, str, str], Program]] = {
-    Model: _lower_lagged,
-    MotionModel: _motion,
+    LaggedDynamics: _lower_lagged,
+    MotionDynamics: _motion,
 }
 
 
@@ -442,7 +448,7 @@ def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vec
     return Network(tuple(scaled), tuple(layers))
 
 
-def _scheme(model: MotionModel) -> Scheme:
+def _scheme(model: Model[MotionDynamics]) -> Scheme:
     form = model.form
     kind, substeps = form.motion.integrator, form.substeps
     h = model.sampling_time / substeps

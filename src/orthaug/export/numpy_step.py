@@ -13,7 +13,6 @@ from orthaug.export.lowering import program_of
 from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.physics.integrators import INTEGRATORS
 
 Values = dict[str, Any]
@@ -144,7 +143,7 @@ class NumpyStep:
         return lambda values: function(first(values), second(values))
 
 
-def numpy_step(model: Model | MotionModel) -> NumpyStep:
+def numpy_step(model: Model) -> NumpyStep:
     """Return the step of a fitted model in NumPy, for loops in Python.
 
     It is for places where JAX is too slow to call.

@@ -13,11 +13,17 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import fold
 from orthaug._base.views import FitView
+from orthaug.data.record import Record
+from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Simulation
+from orthaug.fitting.status import Status
+from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame
 from orthaug.inference.over_experiments import FEWEST, OverExperiments, over_experiments
+from orthaug.models.model import Model
 from orthaug.models.statistics import half_inverse
+from orthaug.physics.parameters import Coordinates
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,11 +65,13 @@ class Restart:
 
 
 class AnyFit(FitView):
-    """Methods common to fits of lagged models and of motions."""
+    """Fields and methods common to fits of lagged models and of motions."""
 
-    model: Any
+    model: Model[Any]
     problem: Any
+    status: Status
     covariance: Matrix | None
+    plain_covariance: Matrix | None
     freedom: float
     scores: FreeRunScores | None
     warnings: tuple[Warning, ...]
@@ -72,6 +80,76 @@ class AnyFit(FitView):
     def theta(self) -> Vector:
         """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
         return self.model.theta
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The parameters, and the map from θ̂ to their values."""
+        return self.model.form.coordinates
+
+    @property
+    def values(self) -> Vector:
+        """The parameters' values: θ̂ (nθ,), or p̂ (np,) of a motion."""
+        return np.asarray(self.coordinates.physical(self.theta))
+
+    @property
+    def std(self) -> Vector | None:
+        """Standard errors of the values, NaN where one has none."""
+        return self._std_of(self.covariance)
+
+    @property
+    def plain_std(self) -> Vector | None:
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
+        """
+        return self._std_of(self.plain_covariance)
+
+    def _std_of(self, covariance: Matrix | None) -> Vector | None:
+        """Return standard errors by the delta method, from a covariance of θ̂."""
+        if covariance is None:
+            return None
+        return np.sqrt(np.diag(covariance)) * np.abs(self.coordinates.slopes(self.theta))
+
+    @property
+    def interval(self) -> Matrix | None:
+        """95 % intervals of the values (nθ, 2); those of positive parameters are positive."""
+        if self.covariance is None:
+            return None
+        std = np.sqrt(np.diag(self.covariance))
+        return self._ends(interval(self.theta, std, max(self.freedom, 1.0)))
+
+    def _ends(self, limits: Matrix) -> Matrix:
+        """Return intervals of θ̂ (nθ, 2) as those of the values."""
+        return np.stack([self.coordinates.physical(side) for side in limits.T], axis=-1)
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, 95 % interval.
+
+        Of a motion also whether a learner could imitate it, `shared`.
+        """
+        table = parameter_frame(self.coordinates.parameters, self.values, self.std, self.interval)
+        return table.assign(**self._more_columns())
+
+    def _more_columns(self) -> dict[str, Any]:
+        """Return further columns of `parameters`."""
+        return {}
+
+    @property
+    def layout(self) -> Layout:
+        """Names of the entries of `reach`."""
+        return self.problem.layout
+
+    def reach(self, record: Record) -> Matrix:
+        """Return the points of a record at which the physics is evaluated, (N, nx)."""
+        return self.model.reach(record)
+
+    def __repr__(self) -> str:
+        values = zip(self.coordinates.parameters, self.values, strict=True)
+        return (
+            f"{type(self).__name__}({self.model.structure}, {self.status.code}, loss "
+            f"{self.status.loss:.3g}, {', '.join(f'{p.name} = {v:.6g}' for p, v in values)})"
+        )
 
     @property
     def learns(self) -> bool:
@@ -115,7 +193,11 @@ class AnyFit(FitView):
         raise NotImplementedError
 
     def _over_experiments(self, changes: Matrix) -> OverExperiments:
-        return over_experiments(changes, np.asarray(self.covariance), self.freedom, self.theta)
+        slopes = self.coordinates.slopes(self.theta)
+        found = over_experiments(
+            changes, np.asarray(self.covariance), self.freedom, self.theta, slopes
+        )
+        return replace(found, interval=self._ends(found.interval))
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
         """Return the derivative of θ by (c, w), and which entries of these move."""

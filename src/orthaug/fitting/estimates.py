@@ -12,14 +12,12 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug.data.record import Record
-from orthaug.data.regressors import Layout, lag_rows
 from orthaug.fitting.any_fit import (
     STD_KINDS,
     WITHHELD,
     AnyFit,
     Restart,
     left_out,
-    parameter_frame,
     parameter_lines,
 )
 from orthaug.fitting.block_scores import FreeRunScores
@@ -28,7 +26,6 @@ from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.output_noise import OutputNoise, noise_of
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import (
-    interval,
     joint_covariance,
     robust_covariance,
     robust_split_covariance,
@@ -64,13 +61,13 @@ from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 NOT_UNIQUE = "theta_not_unique"
 """The code of the warning that a split under a measure makes untrue."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Estimate(AnyFit):
     """Result of `estimate`. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
@@ -112,20 +109,10 @@ class Estimate(AnyFit):
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
 
-    @property
-    def values(self) -> Vector:
-        """The parameters' values: θ̂ (nθ,)."""
-        return self.theta
-
-    @property
-    def layout(self) -> Layout:
-        """Names of the entries of `reach`."""
-        return self.problem.layout
-
     def reach(self, record: Record) -> Matrix:
         """Return the regressors (N, nx) of a record in the model's order of channels."""
         own = record is self.problem.record
-        return self.problem.rows.x if own else lag_rows(record, self.problem.layout)
+        return self.problem.rows.x if own else self.model.reach(record)
 
     @property
     def one_step_theta(self) -> Vector | None:
@@ -136,33 +123,6 @@ class Estimate(AnyFit):
         if self.criterion.free_run is None:
             return None
         return self.problem.least_squares
-
-    @property
-    def std(self) -> Vector | None:
-        """Standard errors of θ̂ (nθ,)."""
-        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
-
-    @property
-    def plain_std(self) -> Vector | None:
-        """The standard errors for white noise, where those of `std` are robust.
-
-        None where they are not.
-        """
-        plain = self.plain_covariance
-        return None if plain is None else np.sqrt(np.diag(plain))
-
-    @property
-    def interval(self) -> Matrix | None:
-        """95 % intervals of θ̂ (nθ, 2)."""
-        std = self.std
-        return None if std is None else interval(self.theta, std, self.freedom)
-
-    @cached_property
-    def parameters(self) -> pd.DataFrame:
-        """Table with a row per parameter: unit, initial, value, std, and the 95 % interval."""
-        return parameter_frame(
-            self.problem.baseline.parameters, self.theta, self.std, self.interval
-        )
 
     @cached_property
     def noise(self) -> tuple[OutputNoise, ...]:
@@ -438,15 +398,6 @@ class Estimate(AnyFit):
     def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
         order = order_of(physics, self.problem.baseline.names, self.problem.record.sampling_time)
         return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
-
-    def __repr__(self) -> str:
-        values = ", ".join(
-            f"{n} = {v:.6g}" for n, v in zip(self.problem.baseline.names, self.theta, strict=True)
-        )
-        return (
-            f"Estimate({self.model.structure}, {self.status.code}, loss "
-            f"{self.status.loss:.3g}, {values})"
-        )
 
     def lines(self) -> list[str]:
         baseline, learner = self.problem.baseline, str(self.model.form.bound)

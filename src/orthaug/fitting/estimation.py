@@ -16,6 +16,7 @@ from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.data.sources import Source, witness
+from orthaug.fitting.any_fit import AnyFit
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -30,8 +31,8 @@ from orthaug.fitting.noise import Noise, declared_noise
 from orthaug.fitting.noise_estimation import check_noise, fit_coloured
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import (
-    check_cost,
     check_no_memory,
+    check_sizes,
     check_solver,
     checked_starts,
     choose_regularizations,
@@ -108,7 +109,7 @@ class Options(TypedDict, total=False):
     ensemble: bool
     blocks: int
     fallback: bool
-    initial: Estimate | Model | None
+    initial: Estimate | MotionEstimate | Model | None
     validation: Record | None
     output_weights: str | Sequence[float]
     progress: ProgressCallback | bool
@@ -140,7 +141,7 @@ def estimate(
     ensemble: bool = False,
     blocks: int = 4,
     fallback: bool = True,
-    initial: Estimate | Model | None = None,
+    initial: Estimate | MotionEstimate | Model | None = None,
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
     progress: ProgressCallback = SILENT,
@@ -158,8 +159,8 @@ def estimate(
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
             where they are.
-        baseline: the physics; a `Motion` has no `lags`, `ensemble` and `initial`. A `System`, such
-            as `HammersteinWiener(order=2)`, writes a motion for the record.
+        baseline: the physics; a `Motion` has no `lags` and no `ensemble`. A `System`, such as
+            `HammersteinWiener(order=2)`, writes a motion for the record.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
@@ -229,21 +230,29 @@ def estimate(
         check_record(record, moves=True)
         assert isinstance(record, Record)
         baseline = baseline.motion(record)
+    check_type(initial, AnyFit | Model | None, "initial", "an Estimate, a Model or None")
+    model = initial.model if isinstance(initial, AnyFit) else initial
     if isinstance(baseline, Motion):
         if noise != "white":
             raise InputError(
                 "a motion has white noise on its outputs; leave out `noise`, or fit the physics in "
                 "its lagged form."
             )
-        if lags is not None or initial is not None or ensemble:
+        if lags is not None:
             raise InputError(
-                "a motion has no `lags`, no `initial` and no `ensemble`; leave them out."
+                "a motion has no `lags`: its learner sees states and inputs; leave them out."
+            )
+        if ensemble:
+            raise InputError(
+                "a motion has no `ensemble`: medians of outputs follow no equations of motion; "
+                "leave it out."
             )
         check_record(record, moves=True)
         assert isinstance(record, Record)
         learner = over_states(learner, baseline)
-        problem = pose_for(record, baseline, learner, output_weights)
+        problem = pose_for(record, baseline, learner, output_weights, model)
         options |= {
+            "initial": model,
             "criterion": criterion or DEFAULT,
             "blocks": _check_blocks(blocks),
             "engine": engine or InMemory(),
@@ -251,16 +260,16 @@ def estimate(
         return fit_motion(problem, learner=learner, **options)
     check_record(record)
     _check_types(baseline=baseline, lags=lags, learner=learner)
-    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     criterion = Prediction() if criterion is None else criterion
-    model = initial.model if isinstance(initial, Estimate) else initial
+    if model is not None and not model.form.separates:
+        raise InputError("`initial` is a motion, which has no regressor; fit anew.")
     channels = (
         tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
     )
     learner = over_lags(learner, baseline, lags, *channels)
     inputs = declared(learner).inputs
     if model is not None:
-        inputs = tuple(str(entry) for entry in model.form.features.entries)
+        inputs = tuple(str(entry) for entry in model.form.entries)
     _check_types(criterion=criterion)
     problem, engine = pose_source(
         record, engine, baseline, lags, inputs, output_weights=output_weights
@@ -373,7 +382,8 @@ def fit(
         task, weights, warm = _warm_start(problem, initial, engine)
         starts = [PlannedRun(0, weights, choice) for choice in choices]
     else:
-        _check_cost(problem, learner, solver, restarts * len(choices), engine)
+        runs = restarts * len(choices)
+        check_sizes(problem, learner, iterations=solver.iterations, runs=runs, room=engine.room())
         if problem.noise is None:  # a fit under a noise model has left them out already
             problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
@@ -446,25 +456,6 @@ def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
     """Return physics alone, which is solved: it ends at the loss where it starts."""
     estimate = conclude(task, structure, task.physics_learned())
     return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
-
-
-def _check_cost(
-    problem: Problem, learner: Learner, solver: Solver, runs: int, engine: Engine
-) -> None:
-    """Raise InputError for a fit that would take more memory or time than there is."""
-    sizes = {
-        "rows": problem.count,
-        "features": len(problem.features.entries),
-        "outputs": len(problem.outputs),
-    }
-    check_cost(
-        learner,
-        **sizes,
-        held=len(problem.rows),
-        iterations=solver.iterations,
-        runs=runs,
-        room=engine.room(),
-    )
 
 
 def _check_blocks(blocks: int) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -11,14 +11,11 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug.data.record import Record
-from orthaug.data.regressors import Layout
 from orthaug.fitting.any_fit import (
     STD_KINDS,
     WITHHELD,
     AnyFit,
     Restart,
-    parameter_frame,
     parameter_lines,
 )
 from orthaug.fitting.block_scores import FreeRunScores
@@ -26,7 +23,6 @@ from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.field_points import field_under, wobble
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import learned_terms, term_lines
 from orthaug.inference.measures import OF_ROWS, Measure, Training
 from orthaug.inference.motion_split import (
@@ -37,13 +33,12 @@ from orthaug.inference.motion_split import (
 )
 from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.over_experiments import (
-    OverExperiments,
-    over_experiments,
     split_without_each,
 )
 from orthaug.models.dynamics import Numbers
+from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
-from orthaug.models.motion_model import MotionModel
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.statistics import JointCovariance, column_units
 from orthaug.physics import ill_conditioned
 from orthaug.physics.excitation import Excitation, of_gram
@@ -52,8 +47,6 @@ from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from orthaug.fitting.segmented_motion import SegmentedMotion
 
 # share of a parameter in directions that no output shows, above which it is not identified
@@ -64,14 +57,14 @@ _LEANING = 2.0
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MotionEstimate(AnyFit):
     """Result of `estimate` for a motion.
 
     Print `fit.summary()`; use `fit.model`; read `fit.parameters`.
     """
 
-    model: MotionModel
+    model: Model[MotionDynamics]
     status: Status
     restarts: tuple[Restart, ...]
     covariance: Matrix | None
@@ -121,61 +114,13 @@ class MotionEstimate(AnyFit):
         return of_gram(gram[:count, :count], names)
 
     @property
-    def layout(self) -> Layout:
-        """Names of the entries of `reach`."""
-        return self.problem.layout
-
-    def reach(self, record: Record) -> Matrix:
-        """Return the states and inputs (N, nx + nu) of the free run, where they are finite."""
-        return self.model.reach(record)
-
-    @property
     def shared(self) -> SharedDirections:
         """The directions of the parameters' coordinates that the learner could imitate."""
         return self.split_by.shared
 
-    @property
-    def values(self) -> Vector:
-        """p̂ (np,)."""
-        return self.problem.motion.coordinates.physical(self.theta)
-
-    @property
-    def std(self) -> Vector | None:
-        """Standard errors of p̂ (np,), NaN where one has none."""
-        return self._std_of(self.covariance)
-
-    @property
-    def plain_std(self) -> Vector | None:
-        """The standard errors for white noise, where those of `std` are robust.
-
-        None where they are not.
-        """
-        return self._std_of(self.plain_covariance)
-
-    def _std_of(self, covariance: Matrix | None) -> Vector | None:
-        """Return standard errors by the delta method, from a covariance of the coordinates."""
-        if covariance is None:
-            return None
-        return np.sqrt(np.diag(covariance)) * np.abs(
-            self.problem.motion.coordinates.slopes(self.theta)
-        )
-
-    @property
-    def interval(self) -> Matrix | None:
-        """95 % intervals of p̂ (np, 2); those of positive parameters are positive."""
-        if self.covariance is None:
-            return None
-        ends = interval(self.theta, np.sqrt(np.diag(self.covariance)), max(self.freedom, 1.0))
-        return np.stack(
-            [self.problem.motion.coordinates.physical(side) for side in ends.T], axis=-1
-        )
-
-    @cached_property
-    def parameters(self) -> pd.DataFrame:
-        """Table with a row per parameter: unit, initial, value, std, 95 % interval, shared."""
-        motion = self.problem.motion
-        table = parameter_frame(motion.parameters, self.values, self.std, self.interval)
-        return table.assign(shared=[name not in self.shared.untouched for name in motion.names])
+    def _more_columns(self) -> dict[str, Any]:
+        names = self.problem.motion.names
+        return {"shared": [name not in self.shared.untouched for name in names]}
 
     def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
         """Return the same motion with p̂ under another measure over states and inputs.
@@ -265,24 +210,6 @@ class MotionEstimate(AnyFit):
             Projection.factor(slopes * unit[..., None]), basis, values * unit, every, len(changes)
         )
         return None if found is None else changes + found
-
-    def _over_experiments(self, changes: Matrix) -> OverExperiments:
-        coordinates = self.problem.motion.coordinates
-        found = over_experiments(
-            changes,
-            np.asarray(self.covariance),
-            self.freedom,
-            self.theta,
-            coordinates.slopes(self.theta),
-        )
-        ends = [coordinates.physical(side) for side in found.interval.T]
-        return replace(found, interval=np.stack(ends, axis=-1))
-
-    def __repr__(self) -> str:
-        values = ", ".join(
-            f"{n} = {v:.6g}" for n, v in zip(self.problem.motion.names, self.values, strict=True)
-        )
-        return f"MotionEstimate({self.status.code}, loss {self.status.loss:.3g}, {values})"
 
     def lines(self) -> list[str]:
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form

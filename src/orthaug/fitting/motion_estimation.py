@@ -21,6 +21,7 @@ from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.rules import (
     check_motion_choices,
+    check_sizes,
     check_solver,
     checked_starts,
     choose_regularizations,
@@ -30,13 +31,16 @@ from orthaug.fitting.silence import is_silenced, learner_silent
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import ALONE, Ending, Status
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, plan_runs, train
+from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
 from orthaug.fitting.unfinished import ending_in_words, is_unfinished, not_converged, withheld
+from orthaug.fitting.warm_motion import WarmMotionTask, check_initial_motion, with_its_memory
 from orthaug.inference.motion_split import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.learners import Learner, Scaling, declared, learns
-from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.model import Model, TrainedSegments
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.rows import Engine, InMemory
+from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
 from orthaug.physics.memory import Memory
@@ -50,16 +54,26 @@ left out.
 
 
 def pose_for(
-    record: Record, motion: Motion, learner: Learner | None, output_weights: str | Sequence[float]
+    record: Record,
+    motion: Motion,
+    learner: Learner | None,
+    output_weights: str | Sequence[float],
+    initial: Model[MotionDynamics] | None = None,
 ) -> MotionProblem:
-    """Return the problem of a motion with the inputs of a learner.
+    """Return the problem of a motion with the inputs of a learner, or of an earlier model's.
 
     Raises:
-        InputError: as `pose_motion`.
+        InputError: as `pose_motion`; a model that is not of this motion.
     """
     check_type(record, Record, "record", "a Record")
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
-    return pose_motion(record, motion, declared(learner).inputs, output_weights, Memory.of(learner))
+    if initial is None:
+        return pose_motion(
+            record, motion, declared(learner).inputs, output_weights, Memory.of(learner)
+        )
+    motion = with_its_memory(initial, motion)
+    check_initial_motion(initial, motion)
+    return pose_motion(record, motion, [e.text for e in initial.form.entries], output_weights)
 
 
 def fit_motion(
@@ -74,6 +88,7 @@ def fit_motion(
     seed: int = 0,
     blocks: int = 4,
     fallback: bool = True,
+    initial: Model[MotionDynamics] | None = None,
     validation: Record | None = None,
     progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
@@ -84,7 +99,7 @@ def fit_motion(
     Raises:
         InputError: what a motion cannot be trained with.
     """
-    learner = declared(learner)
+    learner = declared(learner if initial is None else initial.form.bound.learner)
     criterion = DEFAULT if criterion.automatic else criterion
     criterion = criterion.on(problem.record)
     check_motion_choices(problem.motion, learner, structure, criterion, solver)
@@ -93,14 +108,22 @@ def fit_motion(
     choices = choose_regularizations(
         regularization, solver, criterion, structure, learner=learner, **conditions
     )
-    restarts, seed = checked_starts(restarts, seed, warm=False, ensemble=False)
+    restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=False)
     check_solver(solver, criterion, choices if learns(learner) else ())
-    engine = runs_on(engine) if restarts * len(choices) > 1 else engine
+    runs = len(choices) * (restarts if initial is None else 1)
+    check_sizes(problem, learner, iterations=solver.iterations, runs=runs, room=engine.room())
+    engine = runs_on(engine) if runs > 1 else engine
     kept = None if isinstance(engine, Tasks) else checkpoints
-    task = MotionTask.of(problem, learner, criterion, engine).with_checkpoints(kept)
-    starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
-    retry = isinstance(regularization, str) and regularization == "auto"
-    chosen = Choice(validation, blocks, fallback, retry=retry)
+    if initial is None:
+        task = MotionTask.of(problem, learner, criterion, engine)
+        starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
+    else:
+        check_initial_motion(initial, problem.motion)
+        task = WarmMotionTask.from_model(problem, initial, criterion, engine)
+        starts = [PlannedRun(0, np.asarray(initial.numbers.weights), c) for c in choices]
+    task = task.with_checkpoints(kept)
+    retry = initial is None and isinstance(regularization, str) and regularization == "auto"
+    chosen = Choice(validation, blocks if initial is None else 0, fallback, retry=retry)
     return train(task, starts, structure, solver, chosen, progress, conclude_motion, runner=engine)
 
 
@@ -176,14 +199,16 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
     return values if np.isfinite(values).all() else None
 
 
-def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner) -> MotionModel:
+def _model(
+    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner
+) -> Model[MotionDynamics]:
     record = plan.record
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise
     middle = None
     if noise is not None and learned.gram is not None and learned.middle is not None:
         middle = learned.middle(plan.problem.weight.whitened(noise))
-    model = MotionModel(
+    model = Model(
         form=plan.dynamics,
         numbers=plan.numbers(learned.coefficients, learned.weights),
         outputs=record.outputs,
@@ -193,8 +218,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
         largest_output=np.max([np.abs(e.outputs).max(axis=0) for e in record.experiments], axis=0),
         deviation=plan.deviation,
         weight=plan.weight,
-        loose=plan.loose,
-        window=_WINDOWS[0] * (plan.dynamics.states + 1),
+        starts=EstimatedStates(_WINDOWS[0] * (plan.dynamics.states + 1), plan.loose),
         time_column=record.time_column,
         prepared=record.prepared,
         statistics=Statistics(
@@ -203,7 +227,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     )
     if not learned.ending.usable:
         return model
-    model = replace(model, window=_best_window(model, record))
+    model = _with_window(model, _best_window(model, record))
     return (
         model
         if not model.learns
@@ -211,7 +235,7 @@ def _model(plan: SegmentedMotion, structure: Structure, learned: TrainedLearner)
     )
 
 
-def _with_limits(model: MotionModel, record: Record) -> MotionModel:
+def _with_limits(model: Model[MotionDynamics], record: Record) -> Model[MotionDynamics]:
     """Return the model with the range of its features over the fitted run.
 
     Beyond that range the correction stays constant or fades.
@@ -222,25 +246,31 @@ def _with_limits(model: MotionModel, record: Record) -> MotionModel:
     nx = model.form.states
 
     def features(points: Matrix) -> Matrix:
-        return np.asarray(model.form.seen(points[:, :nx].T, points[:, nx:].T, np)).T
+        return model.form.features_at(points[:, :nx], points[:, nx:])
 
     pull = pull_of(features, model.reach(record))
     return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
-def _feature_range(model: MotionModel, record: Record) -> Matrix | None:
+def _feature_range(model: Model[MotionDynamics], record: Record) -> Matrix | None:
     """Return the least and largest (2, nz) of the learner's features over the free run.
 
     None where it has no finite ones.
     """
     states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
     with np.errstate(all="ignore"):
-        features = np.asarray(model.form.seen(states.T, inputs.T, np))
-    finite = features[:, np.isfinite(features).all(axis=0)]
-    return np.stack([finite.min(axis=1), finite.max(axis=1)]) if finite.size else None
+        features = model.form.features_at(states, inputs)
+    finite = features[np.isfinite(features).all(axis=1)]
+    return np.stack([finite.min(axis=0), finite.max(axis=0)]) if finite.size else None
 
 
-def _best_window(model: MotionModel, record: Record) -> int:
+def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynamics]:
+    """Return the model with another number of rows that give a state to predict from."""
+    assert isinstance(model.starts, EstimatedStates)
+    return replace(model, starts=replace(model.starts, window=window))
+
+
+def _best_window(model: Model[MotionDynamics], record: Record) -> int:
     """Return the window of rows that predicts one step ahead best.
 
     On some of the training data.
@@ -253,7 +283,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
             break
         part = replace(record, experiments=(longest,))
         try:
-            response = replace(model, window=window).predict(part)
+            response = _with_window(model, window).predict(part)
         except InputError:  # not even one window fits
             break
         (trajectory,) = response.trajectories
@@ -268,7 +298,7 @@ def _best_window(model: MotionModel, record: Record) -> int:
     return best
 
 
-def reopen_estimate(model: MotionModel, record: Record) -> MotionEstimate:
+def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstimate:
     """Return the estimate of a saved model with its training data, to split again.
 
     It lacks the results of its training.

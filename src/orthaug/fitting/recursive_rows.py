@@ -23,7 +23,6 @@ from orthaug.inference.covariance import newey_west, whitening_matrix
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.physics.output_weights import times
 
 _BATCH = 256
@@ -216,11 +215,11 @@ def training_rows(fit: Any, training: Record | None) -> TrainingRowsModel:
     """
     check_type(
         fit,
-        Estimate | Model | MotionEstimate | MotionModel,
+        Estimate | MotionEstimate | Model,
         "fit",
         "what `estimate` returned, or a saved model",
     )
-    if isinstance(fit, MotionEstimate | MotionModel):
+    if not (fit if isinstance(fit, Model) else fit.model).form.separates:
         raise InputError(MOTION)
     covariance = None
     if isinstance(fit, Estimate):

@@ -100,7 +100,7 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Rec
         path, folder / _ARRAYS, FORMAT, "recursive estimate", "copy it again"
     )
     model = storage.load(folder / _MODEL, baseline=baseline, learner=learner)
-    if not isinstance(model, Model) or declared.get("model") != storage.digest(model):
+    if not model.form.separates or declared.get("model") != storage.digest(model):
         raise InputError(
             f"{folder}: its model is not that of the recursive estimate; copy the folder again."
         )

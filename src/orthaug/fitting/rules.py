@@ -248,6 +248,24 @@ def check_cost(
         )
 
 
+def check_sizes(problem: Any, learner: Any, *, iterations: int, runs: int, room: Any) -> None:
+    """Raise InputError for a fit that would take more memory or time than there is.
+
+    Args:
+        problem: posed; the other arguments as of `check_cost`.
+    """
+    check_cost(
+        learner,
+        rows=problem.count,
+        features=problem.feature_count,
+        outputs=problem.learner_outputs,
+        held=problem.rows_in_memory,
+        iterations=iterations,
+        runs=runs,
+        room=room,
+    )
+
+
 def _days(seconds: float) -> str:
     days = seconds / 86400
     return (

@@ -21,9 +21,9 @@ from orthaug.fitting.segments import Segments, begins_of, build_segments
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
-from orthaug.models.motion_model import FIRST_ROWS
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import LOOSE, Windows, settle
+from orthaug.models.starts import FIRST_ROWS
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem
 

@@ -2,7 +2,7 @@ from .cluster import Dask as Dask
 from .kalman import Noise as Noise
 from .learners import MLP as MLP
 from .model import Model as Model
-from .motion_model import MotionModel as MotionModel
+from .model import MotionModel as MotionModel
 from .response import Response as Response
 from .response import Trajectory as Trajectory
 from .response import scores as scores

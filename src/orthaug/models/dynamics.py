@@ -6,15 +6,21 @@ case whose state is the past outputs.
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp
+from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
+from orthaug.models.learners import Bound, nothing_learned
+from orthaug.physics.parameters import Coordinates
+
+BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
 
 AnyArray = Any  # of NumPy or of JAX
 
@@ -77,6 +83,13 @@ class Parts(NamedTuple):
         return self.baseline + self.learner
 
 
+class Run(NamedTuple):
+    """States before the rows of a free run (T, n0), and the outputs of its steps (T, ny)."""
+
+    states: Any
+    parts: Parts
+
+
 @runtime_checkable
 class Dynamics(Protocol):
     """A model without its numbers; hashable, so that compiled programs are reused.
@@ -87,6 +100,39 @@ class Dynamics(Protocol):
 
     @property
     def outputs(self) -> tuple[str, ...]: ...
+
+    @property
+    def bound(self) -> Bound:
+        """The learner with its sizes."""
+        ...
+
+    @property
+    def entries(self) -> tuple[Expression, ...]:
+        """What the learner sees, as expressions."""
+        ...
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        ...
+
+    @property
+    def physics_only(self) -> Dynamics:
+        """These dynamics without the learner."""
+        ...
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The parameters of the physics, and the map from θ to their values."""
+        ...
+
+    @property
+    def separates(self) -> bool:
+        """True if a step gives its output in the parts of physics and learner.
+
+        Otherwise a run of the physics alone, from the same start, is the part of the physics.
+        """
+        ...
 
     @property
     def linear(self) -> bool:
@@ -149,16 +195,28 @@ class Dynamics(Protocol):
         """
         ...
 
-    def scaled_features(
-        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Matrix | None:
-        """Return the learner's features (T, nz) along a free run; None if they are not known.
+    def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
+        """Return the learner's features (T, nz) at states (T, n0) and rows of inputs (T, nu)."""
+        ...
 
-        They are in [-1, 1] over the training data.
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The entries of the state as expressions write them."""
+        ...
 
-        `start` (n0,) is its first state, `outputs` (T, ny) are those of the run, `inputs` (T, nu)
-        as its steps read them.
-        """
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        """Yield name, physics and learner (T,) of each learned equation or output along a run."""
+        ...
+
+    @property
+    def has_range(self) -> bool:
+        """True if the range of the learner's features in training is known."""
+        ...
+
+    def run(self, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        """Return the free run from a state along rows of inputs (T, nu)."""
         ...
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
@@ -220,18 +278,46 @@ class Local(NamedTuple):
 class AutodiffDynamics:
     """Derivatives by automatic differentiation of `step`, for dynamics without a faster way.
 
-    `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it.
+    `first_slopes` and `tangents` by automatic differentiation, `states_at` by running it. Without
+    a learner and without parameters, if nothing else is written.
     """
 
+    coordinates: Any = Coordinates(())
+    entries: tuple[Expression, ...] = ()
+    separates = False
     differentiable = True
 
     def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
 
-    def scaled_features(
-        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Matrix | None:
-        return None
+    has_range = True
+
+    @cached_property  # a class of dynamics may have a field of this name instead
+    def bound(self) -> Bound:
+        return nothing_learned()
+
+    @property
+    def learns(self) -> bool:
+        return self.bound.learns
+
+    @property
+    def physics_only(self) -> Any:
+        return self
+
+    @property
+    def state_names(self: Any) -> tuple[str, ...]:
+        return tuple(f"x{i + 1}" for i in range(self.states))
+
+    def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
+        return np.zeros((len(states), 0))
+
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        return iter(())
+
+    def run(self: Any, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        return free_run(self, numbers, start, inputs)
 
     def states_at(
         self: Dynamics,
@@ -240,12 +326,8 @@ class AutodiffDynamics:
         inputs: Matrix,
         rows: Int[np.ndarray, "r"],
     ) -> Float[np.ndarray, "r n0"]:
-        padded = np.zeros((padded_length(len(inputs)), inputs.shape[1]))
-        padded[: len(inputs)] = inputs
         start = self.start(outputs, [self.first_row])[0]
-        return np.asarray(_states(self, numbers, start, padded))[
-            np.asarray(rows, dtype=int) - self.first_row
-        ]
+        return self.run(numbers, start, inputs).states[np.asarray(rows, dtype=int) - self.first_row]
 
     def first_slopes(self: Dynamics, width: int) -> Any:
         n0 = self.states
@@ -277,11 +359,68 @@ class AutodiffDynamics:
         return self.local(numbers, state, inputs).along(slopes)
 
 
+def free_run(form: Dynamics, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+    """Return the free run from a state along rows of inputs (T, nu), a batch of them at a time."""
+    state, pieces = start, []
+    for begin in range(0, len(inputs), BATCH):
+        rows = inputs[begin : begin + BATCH]
+        padded = np.pad(rows, ((0, BATCH - len(rows)), (0, 0)), mode="edge")
+        state, run = _scan(form, numbers, state, padded)
+        pieces.append([np.asarray(part)[: len(rows)] for part in (run.states, *run.parts)])
+    states, *parts = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
+    return Run(states, Parts(*parts))
+
+
 @partial(jax.jit, static_argnames="form")
-def _states(
+def _scan(
     form: Dynamics, numbers: Numbers, state: Float[Array, "n0"], inputs: Float[Array, "T nu"]
-) -> Float[Array, "T n0"]:
-    """Return the state at every row of a free run."""
-    return jax.lax.scan(
-        lambda state, row: (form.step(numbers, state, row)[0], state), state, inputs
-    )[1]
+) -> tuple[Float[Array, "n0"], Run]:
+    """Return the state behind the rows, and the run along them."""
+    numbers = form.prepare(numbers)
+
+    def step(state: Any, row: Any) -> tuple[Any, Run]:
+        following, parts = form.step(numbers, state, row)
+        return following, Run(state, parts)
+
+    return jax.lax.scan(step, state, inputs)
+
+
+@partial(jax.jit, static_argnames="form")
+def last_outputs(
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[Array, "n0 m"],
+    inputs: Float[Array, "T nu m"],
+    steps: Any,
+    added: Float[Array, "T ny m"] | None = None,
+) -> Parts:
+    """Return the last outputs (ny, m) of `steps` of runs side by side.
+
+    What is `added` to an output is the newest part of the state that follows, as of a lagged form.
+    """
+    numbers = form.prepare(numbers)
+    side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
+
+    def step(i: Any, states: Any) -> Any:
+        following = side_by_side(states, inputs[i])[0]
+        return following if added is None else following.at[: added.shape[1]].add(added[i])
+
+    states = jax.lax.fori_loop(0, steps - 1, step, states)
+    return side_by_side(states, inputs[steps - 1])[1]
+
+
+def in_batches(
+    function: Callable[..., Parts], rows: tuple[np.ndarray, ...], largest: int = BATCH
+) -> Parts:
+    """Call `function` on batches of rows, padded to one shape, and concatenate its results."""
+    count = len(rows[0])
+    size, pieces = min(BATCH, largest), []
+    for begin in range(0, count, size):
+        batch = [array[begin : begin + size] for array in rows]
+        padding = size - len(batch[0])
+        padded = [
+            np.concatenate([b, np.repeat(b[-1:], padding, axis=0)]) if padding else b for b in batch
+        ]
+        parts = function(*padded)
+        pieces.append([np.asarray(part)[: size - padding] for part in parts])
+    return Parts(*(np.concatenate(piece) for piece in zip(*pieces, strict=True)))

@@ -85,6 +85,20 @@ class Filter(Protocol):
         """Return the inputs of the steps (T, nu), from the first row on."""
         ...
 
+    def start(
+        self, experiment: Experiment, record: Record, row: int, noise: Noise, size: Vector
+    ) -> StateEstimate:
+        """Return the estimate before a row; what is unknown has the `size` of an unknown state."""
+        ...
+
+    def unit(self, noise: Matrix, size: Vector) -> Matrix:
+        """Return a disturbance Q, up to its share, from the outputs' errors or the states' size."""
+        ...
+
+    def linearised(self, numbers: Numbers) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """Return A and C at the origin, and the gains of a disturbance on state and outputs."""
+        ...
+
     def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
         """Return one step without noise."""
         ...

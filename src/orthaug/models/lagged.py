@@ -8,7 +8,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,13 +18,14 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.data.expressions import Lag
+from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
-from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
-from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.beyond import beyond_of, clip_to_range, outside, remaining_factor
+from orthaug.models.dynamics import Numbers, Parts, Run, free_run, in_batches
 from orthaug.models.learners import Bound, nothing_learned
 from orthaug.physics.baseline import Baseline
+from orthaug.physics.parameters import Coordinates
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,21 @@ class LaggedDynamics:
         return replace(self, features=Features(()), bound=nothing_learned(len(self.outputs)))
 
     @property
+    def entries(self) -> tuple[Expression, ...]:
+        """What the learner sees, as expressions."""
+        return self.features.entries
+
+    @property
     def learns(self) -> bool:
         """False where the physics is alone."""
         return self.bound.learns
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """θ itself, as the criterion is linear in it."""
+        return Coordinates(self.baseline.parameters, logarithms=False)
+
+    separates = True
 
     @property
     def linear(self) -> bool:
@@ -122,24 +135,31 @@ class LaggedDynamics:
         """Return the run's own past outputs, so that no step is computed again."""
         return self.start(outputs, rows)
 
-    def scaled_features(
-        self, numbers: Numbers, start: Vector, outputs: Matrix, inputs: Matrix
-    ) -> Float[np.ndarray, "T nz"] | None:
-        """Return the learner's features along a free run, in [-1, 1] over the training data.
-
-        None without a learner, and of a function from another toolbox, whose features are not
-        scaled.
-        """
-        if not (self.learns and self.differentiable):
-            return None
-        before = start.reshape(self.memory, len(self.outputs))[::-1]
-        states = self.start(
-            np.concatenate([before, outputs]), self.memory + np.arange(len(outputs))
-        )
+    def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
         x = self.regressor(states.T, inputs.T, np).T
-        return (
-            np.asarray(self.features.evaluate(x, self.layout, np)) - numbers.centre
-        ) / numbers.halfwidth
+        return np.asarray(self.features.evaluate(x, self.layout, np))
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return tuple(
+            str(Lag(name, lag)) for lag in range(1, self.memory + 1) for name in self.outputs
+        )
+
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        yield from zip(self.outputs, run.parts.baseline.T, run.parts.learner.T, strict=True)
+
+    @property
+    def has_range(self) -> bool:
+        """False for a function from another toolbox: its features are not scaled."""
+        return self.differentiable
+
+    def run(self, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        """Return the free run; without feedback its rows are independent of each other."""
+        if self.states:
+            return free_run(self, numbers, start, inputs)
+        return Run(np.zeros((len(inputs), 0)), self.parts_at(numbers, inputs))
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """Return the entries of the regressor."""
@@ -172,6 +192,17 @@ class LaggedDynamics:
             share, z = remaining_factor(self.beyond, numbers.limits, z), inside
         raw = _learned_output(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
+
+    def parts_at(self, numbers: Numbers, x: Matrix) -> Parts:
+        """Return the prediction at measured regressors (T, nx), in parts."""
+        return in_batches(lambda rows: _predict_rows(self, numbers, rows), (x,))
+
+    def learner_at(self, numbers: Numbers, x: Matrix) -> Matrix:
+        """Return f (T, ny) at regressors (T, nx), in the outputs' units, whatever limits it has."""
+        limits = numbers.limits
+        if limits is not None and outside(limits, self.features.evaluate(x, self.layout, np)).any():
+            numbers = numbers.free
+        return self.parts_at(numbers, x).raw
 
     def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers unchanged: nothing is common to all steps."""
@@ -232,6 +263,11 @@ class LaggedDynamics:
             jnp.where(jnp.isfinite(d), d, 0.0) for d in (jnp.stack(slopes), jnp.stack(feedback))
         )
         return value, slope, back
+
+
+@partial(jax.jit, static_argnames="form")
+def _predict_rows(form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"]) -> Parts:
+    return jax.vmap(lambda row: form.at(numbers, row))(x)
 
 
 def _learned_output(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:

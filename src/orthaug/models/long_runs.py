@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.checks import Matrix
 from orthaug.data.record import Experiment
 from orthaug.data.sources import Source, as_record
-from orthaug.models.dynamics import Parts
+from orthaug.models.dynamics import Run
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
 from orthaug.models.response import Response, Scores, scores_of
@@ -19,14 +19,11 @@ from orthaug.physics.problem import Moments
 
 
 class RunPiece(NamedTuple):
-    """A piece, the free run (m, ny) over its rows behind the history, and the initial state.
-
-    The run is in parts.
-    """
+    """A piece, the inputs of its steps, and the free run over its rows behind the history."""
 
     piece: Experiment
-    state: Any
-    run: Parts
+    inputs: Matrix
+    run: Run
 
 
 def pieces_of(model: Model, source: Source) -> Iterator[Experiment]:
@@ -48,9 +45,10 @@ def run_pieces(model: Model, source: Source) -> Iterator[RunPiece]:
     for piece in pieces_of(model, source):
         if ended != (piece.source, piece.offset + first):
             state = model.form.start(piece.outputs[:first], [first])[0]
-        run = model.run_parts(state, model.form.inputs(piece, record))
-        yield RunPiece(piece, state, run)
-        state = _state_after(model, state, np.asarray(run.total))
+        inputs = model.form.inputs(piece, record)
+        run = model.form.run(model.numbers, state, inputs)
+        yield RunPiece(piece, inputs, run)
+        state = _state_after(model, state, np.asarray(run.parts.total))
         ended = piece.source, piece.offset + len(piece)
 
 
@@ -65,8 +63,8 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
             yield piece, model.predict(replace(record, experiments=(piece,)))
         return
     lost: tuple[str, int] | None = None
-    for piece, state, run in run_pieces(model, source):
-        run_piece = model.as_trajectory(state, run, piece, record)
+    for piece, inputs, run in run_pieces(model, source):
+        run_piece = model.as_trajectory(run, inputs, piece, record)
         before = lost == (piece.source, piece.offset + model.form.first_row)
         if before:
             run_piece = replace(
@@ -137,15 +135,15 @@ def scores_along(
     """
     record, first = as_record(source, (_empty_experiment(source),)), model.form.first_row
     one_step, free, diverged = RunningScores(), RunningScores(), None
-    for piece, _, parts in run_pieces(model, source):
+    for piece, _, run in run_pieces(model, source):
         kept = slice(max(skip - piece.offset - first, 0), None)
-        measured, run = piece.outputs[first:], np.asarray(parts.total)
+        measured, free_run = piece.outputs[first:], np.asarray(run.parts.total)
         ahead = np.asarray(model.parts_at(model.form.regressors(piece, record)).total)
         if watch is not None:
             watch(piece, first, measured - ahead)
         one_step.add(measured[kept], ahead[kept])
-        free.add(measured[kept], run[kept])
-        diverged = diverged or _runaway(model, piece, first, run)
+        free.add(measured[kept], free_run[kept])
+        diverged = diverged or _runaway(model, piece, first, free_run)
     return LongScores(one_step.scores(), free.scores(), diverged)
 
 

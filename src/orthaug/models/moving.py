@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
-from orthaug.data.expressions import Lag
+from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts
+from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts, Run
 from orthaug.models.learners import nothing_learned
-from orthaug.models.motion_field import MotionField
+from orthaug.models.motion_field import MotionField, parts_at
 from orthaug.physics.integrators import (
     UNROLLED,
     Exponentials,
@@ -25,6 +25,7 @@ from orthaug.physics.integrators import (
     inputs_at_points,
 )
 from orthaug.physics.motion_problem import guess, layout_of
+from orthaug.physics.parameters import Coordinates
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
 
@@ -163,8 +164,19 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     """A motion with a learner as dynamics, without its numbers: `Dynamics`."""
 
     linear = False
+    separates = False
     first_row = 0
     memory = 0
+
+    @property
+    def entries(self) -> tuple[Expression, ...]:
+        """What the learner sees, as expressions."""
+        return self.features
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The parameters and the map from their coordinates."""
+        return self.motion.coordinates
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -199,6 +211,22 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
         return inputs_at_points(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
+
+    def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
+        return np.asarray(self.seen(states.T, self.now(inputs).T, np)).T
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        return self.motion.names_of_states
+
+    def learned_along(
+        self, numbers: Numbers, run: Run, inputs: Matrix
+    ) -> Iterator[tuple[str, Vector, Vector]]:
+        """Yield the rates of learned equations, and learned outputs."""
+        parts = parts_at(self, numbers, run.states, self.now(inputs))
+        states, outputs = self.motion.learned
+        names = [self.state_names[i] for i in states] + [self.outputs[i] for i in outputs]
+        yield from zip(names, *(part.T for part in parts), strict=True)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
         """Return states and inputs by name."""

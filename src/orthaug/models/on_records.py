@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Generic, Self, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool
@@ -12,34 +12,52 @@ from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, show
 from orthaug.data.preparation import steps_again
 from orthaug.data.record import Channel, Experiment, Preparation, Record, same_step
-from orthaug.models.dynamics import Numbers, Parts
+from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
-
-if TYPE_CHECKING:
-    from orthaug.models.lagged import LaggedDynamics
-    from orthaug.models.moving import MotionDynamics
+from orthaug.physics.noise import NoiseModel
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 
 WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrapolation
 
 
-class RecordModel:
+Form = TypeVar("Form", bound=Dynamics)
+
+
+class RecordModel(Generic[Form]):
     """A model of some channels at a sampling time."""
 
-    form: LaggedDynamics | MotionDynamics
+    form: Form
     numbers: Numbers
     outputs: tuple[Channel, ...]
     inputs: tuple[Channel, ...]
     sampling_time: float
     largest_output: Vector
+    deviation: Vector
+    weight: Matrix
     prepared: tuple[Preparation, ...]
+    noise: NoiseModel | None
+
+    @property
+    def coloured(self) -> bool:
+        """Whether a noise model forecasts errors."""
+        return self.noise is not None and not self.noise.white
 
     @property
     def learns(self) -> bool:
         """False where the physics is alone."""
         return self.form.learns
+
+    @property
+    def physics_only(self) -> Self:
+        """The model without its learner."""
+        form, whole = self.form.physics_only, cast(Any, self)
+        gain = np.ones(form.bound.ny)
+        return replace(whole, form=form, numbers=self.numbers.physics_only._replace(gain=gain))
+
+    alone = physics_only
+    """Earlier name of `physics_only`."""
 
     @property
     def preparation(self) -> tuple[Any, ...]:

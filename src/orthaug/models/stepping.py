@@ -21,7 +21,6 @@ from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout
 from orthaug.models.dynamics import Numbers
-from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics
 
 
@@ -99,15 +98,6 @@ def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[An
             f"{state.shape} and {inputs.shape}."
         )
     return state, inputs
-
-
-def step_lagged(
-    form: LaggedDynamics, numbers: Numbers, memory: Memory, state: Any, inputs: Any
-) -> tuple[Any, Any]:
-    """Return the next state and the outputs (ny,) of one sample."""
-    state, inputs = step_arguments(state, inputs, len(memory.lags), len(memory.inputs))
-    y = form.at(numbers, jnp.concatenate([state, inputs])[memory.read]).total
-    return jnp.concatenate([y, inputs, state])[memory.following], y
 
 
 def step_inputs(form: MotionDynamics) -> tuple[str, ...]:

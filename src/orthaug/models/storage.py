@@ -27,10 +27,10 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound, Learner, nothing_learned
-from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel, TrainedSegments
+from orthaug.models.model import Model, TrainedSegments
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.packed_files import pack, read_packed, write_packed
+from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import Baseline, Parameter, Term
 from orthaug.physics.motion import Motion, Output, State
@@ -46,7 +46,7 @@ _SEGMENTATION = ("segment", "washout", "rows")  # of `TrainedSegments`
 _ON_SEGMENTS = ("states", "alone", "slope")
 
 
-def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False) -> None:
+def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
     """Write a model to a folder of its own, whole or not at all.
 
     A model that `save` wrote there before is replaced.
@@ -72,30 +72,30 @@ def save(model: Model | MotionModel, folder: str | Path, *, force: bool = False)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(fit.model, Path(folder, "model"))
         ...     load(Path(folder, "model"))
-        Model(orthogonal, θ: gain, learner: none)
+        Model(orthogonal, gain = 2, learner: none)
     """
     with whole_folder(Path(folder), force=force) as partial:
         write(model, partial)
 
 
-def write(model: Model | MotionModel, folder: Path) -> None:
+def write(model: Model, folder: Path) -> None:
     """Write the two files into an existing folder."""
     write_packed(_pack(model), folder / _DECLARATION, folder / _ARRAYS)
 
 
-def digest(model: Model | MotionModel) -> str:
+def digest(model: Model) -> str:
     """Return the sha256 that identifies a model: `checksum` in the file of this version."""
     return _pack(model)[0]["checksum"]
 
 
-def _pack(model: Model | MotionModel) -> tuple[dict[str, Any], bytes]:
+def _pack(model: Model) -> tuple[dict[str, Any], bytes]:
     """Return the contents of the two files."""
     return pack(FORMAT, *_declare(model))
 
 
 def load(
     folder: str | Path, *, baseline: Baseline | Motion | None = None, learner: Learner | None = None
-) -> Model | MotionModel:
+) -> Model:
     """Read a model that `save` or `orthaug fit` wrote.
 
     Args:
@@ -138,7 +138,7 @@ def load(
 
 def _declare(model: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the declaration of a model, and its arrays; arrays that are None are left out."""
-    kind = next(name for name, physics in _PHYSICS.items() if type(model) is physics.model)
+    kind = next(name for name, physics in _PHYSICS.items() if type(model.form) is physics.form)
     kept, form = model.statistics, model.form
     of_form, of_training, own_arrays = _PHYSICS[kind].declare(model)
     declared = {"kind": kind} if kind != _FIRST else {}
@@ -197,13 +197,13 @@ def _rebuild(
         noise=arrays.get("noise"),
         ridge=arrays["ridge"] if "ridge" in arrays else float(arrays["scalars"][0]),
         freedom=float(arrays["scalars"][1]),
-        simulated=bool(declared.get("flown", kind.model is MotionModel)),
+        simulated=bool(declared.get("flown", kind.simulated)),
         verdict=str(declared.get("verdict", "")),
         disturbance=arrays.get("disturbance"),
         sensor=arrays.get("sensor"),
     )
     # models that weighed every output by itself kept `weight`, the inverse of the deviation
-    return kind.model(
+    return Model(
         numbers=Numbers(
             **{n: arrays.get(f"numbers.{n}") for n in Numbers._fields}  # type: ignore[arg-type]
         ),
@@ -221,7 +221,7 @@ def _rebuild(
 class _Physics(NamedTuple):
     """The part of a file that depends on the kind of physics."""
 
-    model: Callable[..., Any]
+    form: type[Any]
     declare: Callable[[Any], tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]
     """Returns the form and the training as a file declares them, and their arrays."""
     rebuild: Callable[[dict[str, Any], Any, Path], Any]
@@ -230,9 +230,13 @@ class _Physics(NamedTuple):
     """Returns the form and the other fields that only these models have."""
     adds_to_outputs: bool
     """Whether a learner adds to every output."""
+    simulated: bool
+    """Whether files that do not say so were trained on a free run."""
 
 
-def _declare_lagged(model: Model) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+def _declare_lagged(
+    model: Model[LaggedDynamics],
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     form, baseline = model.form, model.form.baseline
     declared = {
         "layout": [list(lag) for lag in form.layout],
@@ -292,7 +296,9 @@ def _lagged_fields(
     return {"form": form, "shared": arrays.get("shared"), "noise": noise}
 
 
-def _declare_motion(model: MotionModel) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+def _declare_motion(
+    model: Model[MotionDynamics],
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     form, motion, trained = model.form, model.form.motion, model.trained
     parameters = []
     for parameter in motion.parameters:
@@ -318,7 +324,8 @@ def _declare_motion(model: MotionModel) -> tuple[dict[str, Any], dict[str, Any],
         "window": model.window,
         "trained": None,
     }
-    arrays = {"loose": model.loose, "seen": model.seen}
+    assert isinstance(model.starts, EstimatedStates)
+    arrays = {"loose": model.starts.loose, "seen": model.seen}
     if trained is not None:
         of_training["trained"] = {key: getattr(trained, key) for key in _SEGMENTATION}
         arrays |= {f"trained.{key}": getattr(trained, key) for key in _ON_SEGMENTS}
@@ -380,8 +387,7 @@ def _motion_fields(
         trained = TrainedSegments(**own)
     return {
         "form": form,
-        "loose": arrays["loose"],
-        "window": int(declared["window"]),
+        "starts": EstimatedStates(int(declared["window"]), arrays["loose"]),
         "trained": trained,
         "seen": arrays.get("seen"),
     }
@@ -389,8 +395,12 @@ def _motion_fields(
 
 _FIRST = "lagged"  # a file of this kind does not name it: once there was no other
 _PHYSICS = {
-    _FIRST: _Physics(Model, _declare_lagged, _rebuild_baseline, _lagged_fields, True),
-    "motion": _Physics(MotionModel, _declare_motion, _rebuild_motion, _motion_fields, False),
+    _FIRST: _Physics(
+        LaggedDynamics, _declare_lagged, _rebuild_baseline, _lagged_fields, True, False
+    ),
+    "motion": _Physics(
+        MotionDynamics, _declare_motion, _rebuild_motion, _motion_fields, False, True
+    ),
 }
 
 
@@ -494,7 +504,7 @@ def check_loaded(model: Any, path: Path) -> None:
     for name, value in (("deviation", model.deviation), ("halfwidth", model.numbers.halfwidth)):
         if (np.asarray(value) < 0).any():
             raise InputError(f"{path}: {name} is negative; it was not written by orthaug.")
-    for entry in getattr(model.form.features, "entries", model.form.features):
+    for entry in model.form.entries:
         if not isinstance(entry.text, str):
             raise InputError(
                 f"{path}: a learner's input is {show(entry.text)}; expected an expression."

@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
-from orthaug.physics.baseline import Baseline, check_bounds
+from orthaug.physics.baseline import Baseline, Parameter, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
@@ -73,7 +73,9 @@ class PhysicalParameter:
 class Coordinates:
     """The map between parameters p (np,) and their estimated coordinates q (np,)."""
 
-    parameters: tuple[PhysicalParameter, ...]
+    parameters: Sequence[Parameter | PhysicalParameter]
+    logarithms: bool = True
+    """Whether positive parameters are estimated as logarithms; θ that is solved for is not."""
 
     @property
     def positive(self) -> Bool[np.ndarray, "np"]:
@@ -81,7 +83,9 @@ class Coordinates:
 
         These cannot be negative and start above zero.
         """
-        return np.array([p.min >= 0 and p.initial > 0 for p in self.parameters], dtype=bool)
+        return np.array(
+            [self.logarithms and p.min >= 0 and p.initial > 0 for p in self.parameters], dtype=bool
+        )
 
     @property
     def initial(self) -> Vector:

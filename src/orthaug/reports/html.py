@@ -14,7 +14,6 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
 from orthaug.reports.result import FitResult
@@ -210,8 +209,7 @@ def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
 
 
 @card_of.register(Model)
-@card_of.register(MotionModel)
-def _model(model: Model | MotionModel) -> Card:
+def _model(model: Model) -> Card:
     facts = {
         "structure": model.structure,
         "learner": str(model.form.bound),

@@ -18,7 +18,7 @@ from orthaug.reports.page_blocks import with_unit
 if TYPE_CHECKING:
     from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.model import Model
-    from orthaug.models.motion_model import MotionModel
+    from orthaug.models.moving import MotionDynamics
 
 _MOST_POINTS = 2000  # of a cloud
 _BATCH = 512  # points of a compiled call
@@ -82,7 +82,7 @@ class LearnedPart:
 
     @classmethod
     def of_motion(
-        cls, model: MotionModel, record: Record, reach: Reach | None = None
+        cls, model: Model[MotionDynamics], record: Record, reach: Reach | None = None
     ) -> LearnedPart:
         """Return the learned part of a motion, along the free run of the first experiment."""
         states, inputs = trajectory_of(model, record)
@@ -273,7 +273,7 @@ def spread_indices(count: int, most: int = _MOST_POINTS) -> np.ndarray:
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
-def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
+def trajectory_of(model: Model[MotionDynamics], record: Record) -> tuple[Matrix, Matrix]:
     """Return states and inputs of the free run of the first experiment, as far as it is finite."""
     record = model.fitting(record, need_outputs=False)
     frame = model.states(record)
@@ -284,13 +284,13 @@ def trajectory_of(model: MotionModel, record: Record) -> tuple[Matrix, Matrix]:
     return states[:end], np.asarray(first.inputs)[:end]
 
 
-def labels_with_units(model: MotionModel) -> list[str]:
+def labels_with_units(model: Model[MotionDynamics]) -> list[str]:
     """Return the labels of learned equations and outputs, with their units."""
     units = {channel.name: channel.unit for channel in model.outputs}
     return [with_unit(name, unit or units.get(name)) for name, unit in labels_of(model.form)]
 
 
-def units_of(model: MotionModel) -> dict[str, str]:
+def units_of(model: Model[MotionDynamics]) -> dict[str, str]:
     """Return the units of states and inputs by name."""
     return {s.name: s.unit for s in model.form.motion.states} | {
         c.name: c.unit for c in model.inputs

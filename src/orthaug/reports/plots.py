@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from orthaug.data.record import Record
+from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
+from orthaug.models.moving import MotionDynamics
 from orthaug.models.response import Response
 from orthaug.reports.drawing import (
     BLACK,
@@ -40,7 +42,6 @@ from orthaug.reports.selection import SelectResult
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthaug.models.motion_model import MotionModel
 
 __all__ = ["save"]
 
@@ -133,7 +134,7 @@ def components_figure(response: Response, title: str) -> Figure:
 
 
 @plain
-def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
+def states_figure(model: Model[MotionDynamics], record: Record, title: str) -> Figure:
     """Draw every state along the free run of the first experiment."""
     states, _ = trajectory_of(model, record)
     motion = model.form.motion
@@ -148,7 +149,7 @@ def states_figure(model: MotionModel, record: Record, title: str) -> Figure:
 
 
 @plain
-def parts_figure(model: MotionModel, record: Record, title: str) -> Figure:
+def parts_figure(model: Model[MotionDynamics], record: Record, title: str) -> Figure:
     """Draw physics and learned part of each learned equation and output, along the free run."""
     states, inputs = trajectory_of(model, record)
     rows = slice(0, min(len(states), 250))

@@ -481,7 +481,7 @@ class DesignResult(Content):
 
 
 def parameter_rows(
-    parameters: Sequence[Parameter] | Sequence[PhysicalParameter],
+    parameters: Sequence[Parameter | PhysicalParameter],
     values: Any,
     std: Any = None,
     interval: Any = None,

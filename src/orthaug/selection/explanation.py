@@ -19,7 +19,6 @@ from orthaug.data.record import Record
 from orthaug.data.terms import CONSTANT
 from orthaug.data.writing import coefficient_unit
 from orthaug.models.model import Model
-from orthaug.models.motion_model import MotionModel
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
@@ -367,9 +366,9 @@ def explain(
         InputError: no learner, other channels, suspects that cannot be read, too many candidates.
     """
     fit = model
-    if not isinstance(model, Model | MotionModel):
+    if not isinstance(model, Model):
         model = getattr(fit, "model", None)
-        if not isinstance(model, Model | MotionModel):
+        if not isinstance(model, Model):
             raise InputError(
                 f"`model` must be a model or what `estimate` returns; got {show(fit)}."
             )

@@ -22,9 +22,9 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
 from orthaug.inference.motion_split import slopes_at
 from orthaug.models.dynamics import Numbers
+from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.motion_field import labels_of, parts_at
-from orthaug.models.motion_model import MotionModel
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.statistics import JointCovariance
 from orthaug.physics.baseline import Baseline, Parameter
@@ -72,7 +72,7 @@ class LearnedLinearization:
     evaluate: Callable[[Expression], Any]
     moved: Callable[[Vector], Vector]
     """The parameters when the physics moves by (s,) along the shared directions."""
-    parameters: Sequence[Parameter] | Sequence[PhysicalParameter]
+    parameters: Sequence[Parameter | PhysicalParameter]
     values: Vector
     physics: Baseline | Motion
     tangent: Tangent | None
@@ -97,7 +97,7 @@ class LearnedLinearization:
         return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
-def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinearization:
+def linearization_of(model: Model, record: Record) -> LearnedLinearization:
     """Return the learner of a model over a record.
 
     Raises:
@@ -105,9 +105,7 @@ def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinea
     """
     if not model.learns:
         raise InputError("the model is physics alone: it has no learner that could be explained.")
-    linearization = (
-        _of_motion(model, record) if isinstance(model, MotionModel) else _of_lagged(model, record)
-    )
+    linearization = _OF_FORM[type(model.form)](model, record)
     if len(linearization.target) < FEWEST:
         raise InputError(
             f"the learner has a value at {len(linearization.target)} rows of the data; at "
@@ -116,7 +114,7 @@ def linearization_of(model: Model | MotionModel, record: Record) -> LearnedLinea
     return linearization
 
 
-def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
+def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLinearization:
     form = model.form
     if form.states and not record.outputs:
         names = ", ".join(channel.name for channel in model.outputs)
@@ -167,7 +165,7 @@ def _of_lagged(model: Model, record: Record) -> LearnedLinearization:
     )
 
 
-def _of_motion(model: MotionModel, record: Record) -> LearnedLinearization:
+def _of_motion(model: Model[MotionDynamics], record: Record) -> LearnedLinearization:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     record = model.fitting(record, need_outputs=False)
     run = _Run.of(model, record)
@@ -316,6 +314,12 @@ class Response:
         return _stack(self.linear.adjoint(values)[:, list(self.learned)])
 
 
+_OF_FORM: dict[type, Callable[[Any, Record], LearnedLinearization]] = {
+    LaggedDynamics: _of_lagged,
+    MotionDynamics: _of_motion,
+}
+
+
 class _Run(NamedTuple):
     """States, inputs, and the rows that steps read, along free runs where they have values.
 
@@ -328,7 +332,7 @@ class _Run(NamedTuple):
     begins: Any
 
     @classmethod
-    def of(cls, model: MotionModel, record: Record) -> _Run:
+    def of(cls, model: Model[MotionDynamics], record: Record) -> _Run:
         """Return the run of a record, of a long one over its first rows."""
         states = model.states(record, initial="measured" if record.outputs else "zero")
         states = states[list(model.form.motion.names_of_states)].to_numpy()
@@ -351,7 +355,7 @@ def _stack(values: Float[np.ndarray, "M n *k"]) -> np.ndarray:
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
-def _places(model: MotionModel) -> tuple[tuple[str, str], ...]:
+def _places(model: Model[MotionDynamics]) -> tuple[tuple[str, str], ...]:
     """Return name and unit of every learned equation, by its state, and of every learned output."""
     motion = model.form.motion
     states, outputs = motion.learned

@@ -1,0 +1,390 @@
+"""The state before a row of a record: past outputs, or an estimate from rows that were measured.
+
+The past outputs of a lagged model are measured. A motion's state is not: it is estimated from the
+first rows of the record or, for a prediction, from a window of rows before it, as the state from
+which a free run over the window follows the measured outputs best.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector, as_signal
+from orthaug._base.errors import InputError
+from orthaug.data.record import Experiment, Record
+from orthaug.data.regressors import lag_rows
+from orthaug.models.dynamics import Numbers, Parts, in_batches, last_outputs
+from orthaug.models.filters import LaggedFilter, MotionFilter
+from orthaug.models.kalman import Filter
+from orthaug.models.lagged import LaggedDynamics
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.on_records import RecordModel
+from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
+from orthaug.models.stepping import Memory, checked_row, step_inputs, with_scheme
+
+FIRST_ROWS = 64  # from which the start of a free run is estimated
+_SIDE_BY_SIDE = 256  # windows of predictions
+_WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
+_GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
+
+
+class Predicted(NamedTuple):
+    """Outputs from a row on: of the model, and of physics alone where that is a run of its own."""
+
+    first: int
+    parts: Parts
+    physics: Matrix | None = None
+    forecast: Matrix | None = None
+    """Errors that a noise model forecasts, (T, ny), to be added to the parts; None without one."""
+
+
+class Starts(Protocol):
+    """Where the state of a run comes from."""
+
+    def rows(self, form: Any) -> int:
+        """Return how many rows of measured outputs determine a state."""
+        ...
+
+    def filtering(self, model: RecordModel) -> tuple[Filter, Numbers, Vector]:
+        """Return the model a sample at a time, its numbers, and the size of an unknown state."""
+        ...
+
+    def step_inputs(self, model: RecordModel) -> tuple[str, ...]:
+        """Return the names of a step's inputs.
+
+        Raises:
+            InputError: a hold that needs the whole record.
+        """
+        ...
+
+    def check_initial(self, model: RecordModel, initial: Any) -> Matrix:
+        """Return outputs that determine the start of a free run, (rows, ny).
+
+        Raises:
+            InputError: too few rows, or not one column per output.
+        """
+        ...
+
+    def first(
+        self, model: RecordModel, experiment: Experiment, record: Record, initial: str | Any
+    ) -> Vector:
+        """Return the state at the first row of a free run.
+
+        Raises:
+            InputError: initial values that are not there.
+        """
+        ...
+
+    def at(
+        self, model: RecordModel, experiment: Experiment, record: Record, row: int | None
+    ) -> Vector:
+        """Return the state before a row, as a filter has it.
+
+        Raises:
+            InputError: a row that is not there.
+        """
+        ...
+
+    def predict(
+        self, model: RecordModel, experiment: Experiment, record: Record, horizon: int
+    ) -> Predicted:
+        """Return the outputs `horizon` samples after the last measured ones.
+
+        Raises:
+            InputError: too few rows.
+        """
+        ...
+
+    def points(self, model: RecordModel, record: Record) -> Matrix:
+        """Return where the physics is evaluated on a record, (N, nx)."""
+        ...
+
+
+def _check_outputs(initial: Any, outputs: int) -> Matrix:
+    """Return given outputs, (rows, ny).
+
+    Raises:
+        InputError: another word, or not one column per output.
+    """
+    if isinstance(initial, str):
+        raise InputError(f"`initial` must be 'measured', 'zero' or an array; got '{initial}'.")
+    rows = as_signal(initial, "initial")
+    if rows.shape[1] != outputs:
+        raise InputError(
+            f"`initial` has {rows.shape[1]} columns; expected one per output, {outputs}."
+        )
+    return rows
+
+
+def _outputs_of(
+    starts: Starts, model: RecordModel, experiment: Experiment, record: Record, initial: Any
+) -> Matrix | None:
+    """Return the outputs that determine the start of a free run; None for a state of zeros."""
+    if isinstance(initial, str) and initial == "zero":
+        return None
+    if not (isinstance(initial, str) and initial == "measured"):
+        return starts.check_initial(model, initial)
+    if not record.outputs:
+        raise InputError(
+            "the record has no measured outputs to start from; use initial='zero' or give the "
+            "values."
+        )
+    return experiment.outputs
+
+
+def _forecast(
+    model: RecordModel[LaggedDynamics], experiment: Experiment, record: Record, horizon: int
+) -> Float[np.ndarray, "m h ny"]:
+    """Return the noise model's forecasts on the way to every row that is predicted."""
+    assert model.noise is not None
+    measured = experiment.outputs[model.form.first_row :]
+    parts = model.form.parts_at(model.numbers, model.form.regressors(experiment, record))
+    return model.noise.forecast_ahead(measured - np.asarray(parts.total), horizon)
+
+
+@dataclass(frozen=True)
+class PastOutputs:
+    """The state is past outputs, as they were measured: `Starts` of a lagged model."""
+
+    def rows(self, form: LaggedDynamics) -> int:
+        return form.first_row
+
+    def filtering(self, model: RecordModel[LaggedDynamics]) -> tuple[Filter, Numbers, Vector]:
+        return LaggedFilter(model.form, self.memory(model)), model.numbers, model.deviation
+
+    def step_inputs(self, model: RecordModel[LaggedDynamics]) -> tuple[str, ...]:
+        return self.memory(model).inputs
+
+    def memory(self, model: RecordModel[LaggedDynamics]) -> Memory:
+        """Return the past samples that a step remembers."""
+        return Memory.of(model.form.layout, model.form.outputs, [c.name for c in model.inputs])
+
+    def check_initial(self, model: RecordModel[LaggedDynamics], initial: Any) -> Matrix:
+        """Return outputs before the first usable row, (rows, ny).
+
+        Raises:
+            InputError: too few rows, or not one column per output.
+        """
+        rows = _check_outputs(initial, len(model.outputs))
+        if len(rows) < model.form.memory:
+            raise InputError(
+                f"`initial` has {len(rows)} rows; expected the first {model.form.first_row} "
+                "outputs of the record."
+            )
+        return rows
+
+    def first(
+        self,
+        model: RecordModel[LaggedDynamics],
+        experiment: Experiment,
+        record: Record,
+        initial: str | Any,
+    ) -> Vector:
+        outputs = _outputs_of(self, model, experiment, record, initial)
+        if outputs is None:
+            return np.zeros(model.form.states)
+        rows = outputs[: model.form.first_row]
+        return model.form.start(rows, [len(rows)])[0]
+
+    def at(
+        self,
+        model: RecordModel[LaggedDynamics],
+        experiment: Experiment,
+        record: Record,
+        row: int | None,
+    ) -> Vector:
+        row = checked_row(row, model.form.first_row, len(experiment))
+        return self.memory(model).at(experiment, record, row)
+
+    def predict(
+        self,
+        model: RecordModel[LaggedDynamics],
+        experiment: Experiment,
+        record: Record,
+        horizon: int,
+    ) -> Predicted:
+        form = model.form
+        first = form.first_row + horizon - 1
+        model.check_rows(experiment, first)
+        forecast = _forecast(model, experiment, record, horizon) if model.coloured else None
+        last = None if forecast is None else forecast[:, -1]
+        if horizon == 1 or not form.states:
+            parts = form.parts_at(model.numbers, form.regressors(experiment, record, first))
+            return Predicted(first, parts, forecast=last)
+        inputs = form.inputs(experiment, record)
+        windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)  # (m, nu, T)
+        rows = form.first_row + np.arange(len(windows))
+
+        def ahead(states: Matrix, windows: np.ndarray, added: np.ndarray | None = None) -> Parts:
+            """Return the last of the steps from each of the states; the windows overlap."""
+            inputs = np.moveaxis(windows, (0, 2), (2, 0))
+            added = None if added is None else np.moveaxis(added, 0, 2)
+            found = last_outputs(form, model.numbers, states.T, inputs, horizon, added)
+            return Parts(*(np.asarray(part).T for part in found))
+
+        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
+        arrays = (form.start(experiment.outputs, rows), windows)
+        arrays = arrays if forecast is None else (*arrays, forecast)
+        return Predicted(first, in_batches(ahead, arrays, largest), forecast=last)
+
+    def points(self, model: RecordModel[LaggedDynamics], record: Record) -> Matrix:
+        """Return the measured regressors of all rows that have one."""
+        return lag_rows(record, model.form.layout)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedStates:
+    """The state is estimated over a window of measured rows: `Starts` of a motion.
+
+    `window` rows give a state to predict from, `loose` (nx,) is how far one may be from its guess.
+    """
+
+    window: int
+    loose: Vector
+
+    def rows(self, form: MotionDynamics) -> int:
+        return self.window
+
+    def filtering(self, model: RecordModel[MotionDynamics]) -> tuple[Filter, Numbers, Vector]:
+        numbers = with_scheme(model.form, model.numbers)
+        return MotionFilter(model.form), numbers, np.asarray(self.loose) / LOOSE
+
+    def step_inputs(self, model: RecordModel[MotionDynamics]) -> tuple[str, ...]:
+        return step_inputs(model.form)
+
+    def check_initial(self, model: RecordModel[MotionDynamics], initial: Any) -> Matrix:
+        """Return outputs of the first rows (rows, ny).
+
+        Raises:
+            InputError: no rows, or not one column per output.
+        """
+        return _check_outputs(initial, len(model.outputs))
+
+    def first(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        initial: str | Any,
+    ) -> Vector:
+        form, size = model.form, max(FIRST_ROWS, self.window)
+        rows = _outputs_of(self, model, experiment, record, initial)
+        if rows is None:
+            return np.zeros(form.states)
+        rows = rows[:size]
+        inputs = form.inputs(experiment, record)[: len(rows)]
+        rows = rows[: len(inputs)]
+        windows = Windows(
+            _pad(inputs, size), _pad(rows, size), (np.arange(size) < len(rows))[:, None]
+        )
+        guess = form.start(rows, [0]).T
+        settled = settle(
+            form, model.numbers, guess, windows, model.weight, self.loose, _GUESS_ITERATIONS
+        )[0]
+        return settled[:, 0]
+
+    def at(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        row: int | None,
+    ) -> Vector:
+        row = checked_row(row, 0, len(experiment) - 1)
+        state = self.first(model, experiment, record, "measured")
+        if not row:
+            return state
+        return model.form.run(model.numbers, state, model.form.inputs(experiment, record)).states[
+            row
+        ]
+
+    def predict(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        horizon: int,
+    ) -> Predicted:
+        model.check_rows(experiment, horizon)
+        # Short recordings have at least one prediction
+        window = min(self.window, len(experiment) - horizon)
+        form, numbers, steps = model.form, model.numbers, window + horizon
+        inputs = form.inputs(experiment, record)
+        begins = np.arange(len(inputs) - steps + 1)
+        states = self._begin(model, experiment, record, begins)
+        ends = [(form, numbers)]
+        if form.learns:
+            alone = model.physics_only
+            ends.append((alone.form, alone.numbers))
+        length, pieces = padded_steps(steps), []  # few horizons have programs of their own
+        for begin in range(0, len(begins), _SIDE_BY_SIDE):
+            chosen = begins[begin : begin + _SIDE_BY_SIDE]
+            padded = np.concatenate([chosen, np.repeat(chosen[-1:], _SIDE_BY_SIDE - len(chosen))])
+            rows = np.minimum(padded[None, :] + np.arange(length)[:, None], len(inputs) - 1)
+            following = np.moveaxis(inputs[rows], -1, 1)
+            target = np.moveaxis(experiment.outputs[rows[:window]], -1, 1)
+            windows = Windows(
+                following[:window], target, np.ones((window, len(padded)), dtype=bool)
+            )
+            settled = settle(
+                form,
+                numbers,
+                states[padded].T,
+                windows,
+                model.weight,
+                self.loose,
+                _WINDOW_ITERATIONS,
+            )[0]
+            pieces.append(
+                [
+                    np.asarray(last_outputs(*end, settled, following, steps).total).T[: len(chosen)]
+                    for end in ends
+                ]
+            )
+        outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
+        nothing = np.zeros_like(outputs)
+        return Predicted(window + horizon - 1, Parts(outputs, nothing, nothing), physics)
+
+    def _begin(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        rows: Vector,
+    ) -> Matrix:
+        """Return guesses of the states at some rows; hidden ones are those of the free run."""
+        form = model.form
+        run = form.run(
+            model.numbers,
+            self.first(model, experiment, record, "measured"),
+            form.inputs(experiment, record),
+        ).states[rows]
+        states = form.start(experiment.outputs, rows)
+        hidden = [i for i, state in enumerate(form.motion.states) if state.from_output is None]
+        with np.errstate(all="ignore"):
+            known = np.isfinite(run).all(axis=1, keepdims=True)
+        states[:, hidden] = np.where(known, run, states)[:, hidden]
+        return states
+
+    def points(self, model: RecordModel[MotionDynamics], record: Record) -> Matrix:
+        """Return the finite states and inputs (N, nx + nu) of the free run."""
+        record = model.fitting(record, need_outputs=False)
+        runs = [
+            model.form.run(
+                model.numbers,
+                self.first(model, experiment, record, "measured"),
+                model.form.inputs(experiment, record),
+            )
+            for experiment in record.experiments
+        ]
+        inputs = np.concatenate([e.inputs for e in record.experiments])
+        points = np.concatenate([np.concatenate([run.states for run in runs]), inputs], axis=1)
+        return points[np.isfinite(points).all(axis=1)]
+
+
+def _pad(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), axis=0)])[..., None]
