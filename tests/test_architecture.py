@@ -74,6 +74,7 @@ CONCEPTS = {
     "data.matlab": "a reader of MATLAB's v5 files",
     "fitting.focus": "the choice of `Auto`",
     "fitting.free_run": "training on the free run",
+    "fitting.noise_estimation": "coefficients and orders of noise models",
     "fitting.recursive_storage": "the format of a saved recursive estimate",
     "fitting.segmented_streamed": "segments of rows that remain in a source",
     "fitting.warm_motion": "training of a motion that goes on from an earlier model",

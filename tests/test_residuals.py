@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from orthaug import InputError
 from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residuals import analyse
-from orthaug.analysis.whiteness import (
+from orthaug.fitting.whiteness import (
     autocorrelation,
     cross_correlation,
     ljung_box,

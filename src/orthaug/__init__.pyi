@@ -49,6 +49,7 @@ from .fitting import Status as Status
 from .fitting import estimate as estimate
 from .fitting import orthogonalize as orthogonalize
 from .fitting.narx import AugmentedNARX as AugmentedNARX
+from .fitting.noise import ARMA as ARMA
 from .fitting.regressor import AugmentedRegressor as AugmentedRegressor
 from .fitting.solvers import AdamLBFGS as AdamLBFGS
 from .fitting.structures import BaselinePenalty as BaselinePenalty

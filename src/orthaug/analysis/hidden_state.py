@@ -24,8 +24,8 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.memory import KINDS, MemoryTerm, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
-from orthaug.analysis.whiteness import whitening_filter
 from orthaug.data.record import Record
+from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics

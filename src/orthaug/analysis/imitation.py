@@ -233,7 +233,7 @@ def _weakest(problem: Problem, determined: Collection[str]) -> tuple[str, float]
     """
     if len(problem.outputs) > 1 or not determined or not problem.count:
         return None
-    physics, terms = problem.projection.phi[:, 0], problem.feature_rows()
+    physics, terms = problem.unfiltered.projection.phi[:, 0], problem.feature_rows()
     left = []
     for columns in (np.concatenate([physics, terms], axis=1), physics):
         size = np.linalg.norm(columns, axis=0)

@@ -94,7 +94,8 @@ class Inconsistency:
             )
         text += (
             " No interval of the one-step θ covers this bias. Train on the free run "
-            '(focus = "simulation"), which does not have it.'
+            '(focus = "simulation"), which does not have it, or with a noise model ([noise] '
+            'model = "auto").'
         )
         return Warning("inconsistent", text)
 
@@ -212,6 +213,8 @@ def _rows(fit: Estimate, one_step: Response) -> _Rows | None:
     ):
         return None
     if isinstance(problem, StreamedProblem) or fit.std is None or model.numbers.tilt is not None:
+        return None
+    if model.coloured:  # its own orders model the colour
         return None
     if rows < _FEWEST or rows * len(problem.outputs) * len(plain.gram) > LARGEST:
         return None

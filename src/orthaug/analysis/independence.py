@@ -16,7 +16,7 @@ import scipy.special
 from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.whiteness import (
+from orthaug.fitting.whiteness import (
     LARGEST,
     Pieces,
     cross_correlation,

@@ -202,7 +202,8 @@ class LaggedTerms:
         if fit is None or fit.model.statistics.noise is None:
             return 0.0
         rows = np.ones((len(own), 1)) * np.sqrt(np.diag(fit.model.statistics.noise))
-        noise = np.sum(self._weigh(rows) ** 2) / own.shape[1]
+        # innovations: no filter of a noise model
+        noise = np.sum(times(self.weighed.unit, rows) ** 2) / own.shape[1]
         taken = fit.effective_weights / self.problem.count * noise
         return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
 
@@ -211,7 +212,7 @@ class LaggedTerms:
         return [*_by_inputs(self, cause, biased), *_by_measure(self, cause, biased)]
 
     def _weigh(self, rows: Matrix) -> Matrix:
-        return times(self.weighed.unit, np.asarray(rows))
+        return self.weighed.times(np.asarray(rows))
 
     def _sampled(self, suspect: Suspect) -> Suspect:
         return suspect.sampled(self.problem.record.sampling_time)

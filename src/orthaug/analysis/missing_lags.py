@@ -89,13 +89,16 @@ class MissingLags:
 def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags | None:
     """Return the tests of a one-step fit.
 
-    None where the learner sees all lags, without a learner, or with too few rows.
+    None where the learner sees all lags, without a learner, with a noise model, or with too few
+    rows.
 
     Args:
         one_step: the prediction of the training data, if it is there already.
     """
     problem = fit.problem
     if fit.criterion.free_run is not None or not problem.features.entries:
+        return None
+    if fit.model.coloured:  # the test takes errors that no filter has passed
         return None
     visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
     hidden = [j for j, one in enumerate(visible) if not one]

@@ -25,8 +25,8 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.analysis.suspects import changes_sign
-from orthaug.analysis.whiteness import whitening_filter
 from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
+from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion

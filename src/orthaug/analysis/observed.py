@@ -9,8 +9,8 @@ import numpy as np
 import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.whiteness import LjungBox, ljung_box
 from orthaug.data.record import Channel
+from orthaug.fitting.whiteness import LjungBox, ljung_box
 from orthaug.models.response import BAND
 
 if TYPE_CHECKING:

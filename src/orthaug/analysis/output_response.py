@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp, padded_length
-from orthaug.analysis.whiteness import LARGEST
 from orthaug.data.record import Record
+from orthaug.fitting.whiteness import LARGEST
 from orthaug.models.model import Model
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.residuals import errors_of
-from orthaug.analysis.whiteness import Pieces, pieces_of
+from orthaug.fitting.whiteness import Pieces, pieces_of
 from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
 from orthaug.physics.problem import Problem

@@ -17,7 +17,8 @@ import scipy.special
 from orthaug._base.checks import Matrix, Vector, check_count, check_number, check_unique
 from orthaug._base.errors import InputError
 from orthaug.analysis.independence import CrossTest, RegressorTest, against_input, against_regressor
-from orthaug.analysis.whiteness import (
+from orthaug.data.record import Experiment
+from orthaug.fitting.whiteness import (
     LARGEST,
     LjungBox,
     Normality,
@@ -27,7 +28,6 @@ from orthaug.analysis.whiteness import (
     normality,
     whitening_filter,
 )
-from orthaug.data.record import Experiment
 from orthaug.models.response import Response
 
 LAGS = 25  # as MATLAB's `resid`

@@ -11,9 +11,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
-from orthaug.analysis.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
 from orthaug.physics.streamed import StreamedProblem
@@ -38,9 +38,9 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
 
     One step ahead that is HC3 where White's test finds that the size of the errors goes with what
     moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
-    prediction of the training rows.
+    prediction of the training rows. With a noise model they are plain: those of its innovations.
     """
-    if not fit.status.ok or fit.covariance is None or fit.at_bound:
+    if not fit.status.ok or fit.covariance is None or fit.at_bound or fit.model.coloured:
         return fit
     if fit.criterion.free_run is not None:
         return robust_free_run(fit)

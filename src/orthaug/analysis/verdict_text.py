@@ -26,13 +26,21 @@ _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 _BIASED = Warning(
     "sensor_noise",
     "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-    'training on the free run (focus = "simulation") has none.',
+    'training on the free run (focus = "simulation") has none, and a noise model ([noise] '
+    'model = "auto") takes it into account.',
 )
 _INCONSISTENT = Warning(
     "coloured_residual",
     "the one-step residual is coloured: a disturbance of one row is in the lagged outputs of the "
     "next. That biases the one-step θ, and its intervals do not cover that bias. Training on the "
-    'free run (focus = "simulation") has none.',
+    'free run (focus = "simulation") has none, and a noise model ([noise] model = "auto") takes it '
+    "into account.",
+)
+_LEFT = Warning(
+    "coloured_residual",
+    "what the noise model leaves is still coloured: its orders are too low, or the physics lacks "
+    "something. θ may be biased, and its intervals do not cover that bias. Take larger orders, "
+    "further lags, or a learner that sees more.",
 )
 _OFF = (
     "The errors are coloured by enough to make the one-step θ inconsistent (warning "
@@ -148,16 +156,20 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     ):
         warnings = (
             *warnings,
-            _INCONSISTENT,
+            _LEFT if seen.fit.model.coloured else _INCONSISTENT,
         )  # where the physics lacks something, a model of the colour gives no θ
     elif verdict != "sensor_noise" and seen.inconsistent is not None:
         return f"{text} {_OFF}", (*warnings, seen.inconsistent)
     plain = seen.fit.std is not None and seen.fit.plain_covariance is None
     if plain and not warnings and not (seen.free_white if seen.simulated else seen.white):
         warnings = (
-            _colour_warning(
-                "errors of the free run are" if seen.simulated else "one-step residual is"
-            ),
+            (_LEFT,)
+            if seen.fit.model.coloured
+            else (
+                _colour_warning(
+                    "errors of the free run are" if seen.simulated else "one-step residual is"
+                ),
+            )
         )
     return text, warnings
 

@@ -236,7 +236,9 @@ def report_of(job: Job, fit: Any) -> FitReport:
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in job.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
-    if fit.status.ok and job.spec.training.chosen_focus() == "prediction" and fit.learns:
+    declared = job.spec.training.chosen_focus() == "prediction"
+    one_step = declared or getattr(fit.model, "coloured", False)  # a noise model decides, too
+    if fit.status.ok and one_step and fit.learns:
         warnings += _one_step_only(
             scores, alone, [part.name for part in job.parts if part not in job.tests]
         )

@@ -429,6 +429,8 @@ class Job:
             if validated and self.validation
             else None,
         }
+        if spec.noise.model != "white":
+            options["noise"] = spec.noise.declared
         if training.ensemble and learner is not None and fold is None:
             options["ensemble"] = True
         return options

@@ -257,6 +257,10 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
 
         return robust_where_asked(fit, one_step)
 
+    def describe(self, fit: Estimate) -> dict[str, Any]:
+        """Return the noise model, where one was asked for."""
+        return {"noise": list(fit.noise)} if fit.status.ok and fit.noise else {}
+
     def analyse(
         self,
         job: Job,
@@ -408,7 +412,8 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
             learns = job.spec.declared_learner() is not None
             along = directions(structure, problem) if learns else None
             return LaggedTerms(weighed, problem, problem.least_squares, self.map, None, along)
-        if fit.problem.weight.kind != problem.weight.kind:  # weighed by the errors of the fit
+        # weighed by the errors of the fit, or filtered by its noise model
+        if fit.problem.weight.kind != problem.weight.kind or fit.problem.noise is not None:
             problem = fit.problem
             weighed = weigh_problem(job.measure, problem)
         learned = fit.model.learner_at(weighed.points.x) if fit.learns else None

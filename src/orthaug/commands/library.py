@@ -28,7 +28,12 @@ from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.opening import job_physics, open_job
 from orthaug.commands.parts import Part
-from orthaug.commands.spec import SelectionSection, TrainingSection, ValidationSection
+from orthaug.commands.spec import (
+    NoiseSection,
+    SelectionSection,
+    TrainingSection,
+    ValidationSection,
+)
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.kinds import STRUCTURES
@@ -155,6 +160,7 @@ class FitFacts:
     training: TrainingSection = field(default_factory=lambda: TrainingSection(fallback=False))
     validation: ValidationSection = field(default_factory=lambda: ValidationSection(blocks=0))
     selection: SelectionSection = field(default_factory=SelectionSection)
+    noise: NoiseSection = field(default_factory=NoiseSection)
 
     def declared_learner(self) -> Any:
         """Return the learner; None without one."""

@@ -35,6 +35,7 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
+from orthaug.fitting.noise import ARMA, UNAVAILABLE, Noise, Order
 from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
@@ -211,6 +212,31 @@ class TrainingSection(KindSection):
         return "prediction" if ahead else self.focus
 
 
+class NoiseSection(Section):
+    """The model of the errors' colour one step ahead: orders, or up to which they are chosen."""
+
+    model: Literal["white", "arma", "innovations", "auto"] = "white"
+    ar: Count | Literal["auto"] | None = None
+    ma: Count | Literal["auto"] | None = None
+    largest: Positive = 4
+
+    @model_validator(mode="after")
+    def _is_available(self) -> NoiseSection:
+        if self.model == "innovations":
+            raise ValueError(f"`noise.model` = innovations {UNAVAILABLE}")
+        return self
+
+    @property
+    def declared(self) -> Noise:
+        """The declaration for `estimate`."""
+        if self.model == "white":
+            return "white"
+        absent: Order = 1 if self.model == "arma" else "auto"
+        ar: Any = absent if self.ar is None else self.ar
+        ma: Any = absent if self.ma is None else self.ma
+        return ARMA(ar, ma, self.largest)
+
+
 class ChosenOnSection(Section):
     """The rows that `orthaug select` chose terms on, which it writes."""
 
@@ -252,6 +278,7 @@ class Spec(Section):
     learner: LearnerSection = LearnerSection()
     structure: StructureSection = StructureSection()
     training: TrainingSection = TrainingSection()
+    noise: NoiseSection = NoiseSection()
     validation: ValidationSection = ValidationSection()
     selection: SelectionSection = SelectionSection()
     engine: EngineSection = EngineSection()
@@ -291,6 +318,36 @@ class Spec(Section):
             raise ValueError(
                 "`training.regularization` is a list; expected [data.validation] or "
                 "`validation.blocks` to choose by"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _noise_fits(self) -> Spec:
+        if self.noise.model == "white":
+            return self
+        found = f"`noise.model`: found {self.noise.model}"
+        if self.motion is not None:
+            raise ValueError(
+                f"{found} beside [motion]; expected white, because a motion has white noise on its "
+                "outputs"
+            )
+        criterion, solver = self.declared_criterion(), self.declared_solver()
+        if criterion.free_run is not None:
+            raise ValueError(
+                f"{found}, but training is not one step ahead; expected `training.focus` "
+                "prediction with a `horizon` of 1, or white noise"
+            )
+        if not solver.gauss_newton or self.declared_structure().from_initial:
+            raise ValueError(
+                f"{found}; expected solver levenberg-marquardt and a solved θ with it, or white "
+                "noise"
+            )
+        if self.training.ensemble:
+            raise ValueError(f"{found}; expected `training.ensemble` = false with it")
+        if self.engine.kind not in ("auto", "memory"):
+            raise ValueError(
+                f"{found} beside `engine.kind` = {self.engine.kind}; expected memory, because the "
+                "filter of a noise model needs all rows in their order"
             )
         return self
 
@@ -399,7 +456,8 @@ class Spec(Section):
         """True if training reads all rows into memory."""
         free_run = self.declared_criterion().free_run
         whole = free_run is not None and not free_run.steps
-        return bool(self.declared_physics.reads_all_rows) or whole
+        coloured = self.noise.model != "white"
+        return bool(self.declared_physics.reads_all_rows) or whole or coloured
 
     def regularizations(
         self, *, linear: bool, validated: bool, kind: str | None = None

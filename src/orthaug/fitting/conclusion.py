@@ -156,6 +156,7 @@ def _model(
         deviation=problem.deviation,
         weight=problem.weight.matrix,
         shared=directions(structure, problem, parameters.fixed),
+        noise=None if problem.noise is None else problem.noise.noise,
         statistics=Statistics(
             None if learned.gram is None else _fix_entries(held, learned.gram),
             None if middle is None else _fix_entries(held, middle),
@@ -187,7 +188,8 @@ def _one_step_errors(
     problem, ny = task.problem, len(task.problem.outputs)
     whitened = task.residual_gram(learned, c)
     freedom = (
-        degrees_of_freedom(problem.count, problem.freedom_used, learned.effective) + len(fixed) / ny
+        degrees_of_freedom(problem.counted, problem.freedom_used, learned.effective)
+        + len(fixed) / ny
     )
     finite = bool(np.isfinite(whitened).all())
     mixed = noise_covariance(whitened, freedom) if finite else None

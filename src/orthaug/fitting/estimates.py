@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from orthaug.fitting.any_fit import (
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
+from orthaug.fitting.output_noise import OutputNoise, noise_of
 from orthaug.fitting.status import Status
 from orthaug.inference.covariance import (
     joint_covariance,
@@ -54,7 +56,6 @@ from orthaug.models.model import Model
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
-from orthaug.physics.output_weights import times
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
@@ -123,6 +124,11 @@ class Estimate(AnyFit):
             return None
         return self.problem.least_squares
 
+    @cached_property
+    def noise(self) -> tuple[OutputNoise, ...]:
+        """Return the noise model of each output; empty where nobody asked for one."""
+        return noise_of(self.model, self.problem)
+
     def split(self, measure: Measure) -> Estimate:
         """Return the same function with θ, components and intervals under a measure (F2).
 
@@ -189,6 +195,11 @@ class Estimate(AnyFit):
             self.model.statistics.gram is None and self.model.numbers.tilt is None
         ):
             raise InputError("the joint covariance needs a one-step fit with its own statistics.")
+        if self.model.coloured:
+            raise InputError(
+                "the joint covariance of θ̂ and weights is for white noise; `covariance` is that of "
+                "θ̂ with the noise model."
+            )
         return joint_covariance(self.problem, self.model, convention)
 
     def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
@@ -210,6 +221,11 @@ class Estimate(AnyFit):
             InputError: a fit without standard errors or with a parameter at a bound; errors that
                 remember each other for too long; a kind that is not for this criterion.
         """
+        if self.model.coloured:
+            raise InputError(
+                "robust standard errors are for fits without a noise model; its own are those of "
+                "white innovations."
+            )
         simulates = self.criterion.free_run is not None
         kinds = (
             ("batch-means", "batch-means-uneven", "autoregressive")
@@ -322,7 +338,7 @@ class Estimate(AnyFit):
             return streamed_slope(self.model, problem)
         points = Points(problem.rows.x, np.ones(len(problem.rows)))
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
-        return learner_slope(self.model, points, problem.projection, unit)
+        return learner_slope(self.model, points, problem.projection, unit, problem.noise)
 
     def _changes_without_each(self) -> Matrix | None:
         problem, split = self.problem, self.measure
@@ -345,7 +361,7 @@ class Estimate(AnyFit):
         if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
             return changes
         weighed = weigh_problem(measure, problem)
-        values = times(weighed.unit, self.model.learner_at(weighed.points.x))
+        values = weighed.times(self.model.learner_at(weighed.points.x))
         every = np.tile(owner, len(values) // len(owner))
         found = split_without_each(
             weighed.projection, self.model.shared, values, every, experiments
@@ -414,6 +430,8 @@ class Estimate(AnyFit):
             lines.append(f"one step    Φ⁺Y would give {moved}")
         if self.plain_covariance is not None:
             lines.append(f"std         {STD_KINDS[self.std_kind]}")
+        if self.model.noise is not None:
+            lines.append(f"noise       {'; '.join(each.text for each in self.noise)}")
         lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
         return [*lines, *term_lines(learned_terms(self.model))]
 

@@ -27,6 +27,8 @@ from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
+from orthaug.fitting.noise import Noise, declared_noise
+from orthaug.fitting.noise_estimation import check_noise, fit_coloured
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import (
     check_no_memory,
@@ -112,6 +114,7 @@ class Options(TypedDict, total=False):
     output_weights: str | Sequence[float]
     progress: ProgressCallback | bool
     engine: Engine | None
+    noise: Noise
 
 
 @overload
@@ -143,6 +146,7 @@ def estimate(
     output_weights: str | Sequence[float] = "auto",
     progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
+    noise: Noise = "white",
 ) -> Estimate | MotionEstimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
 
@@ -192,6 +196,10 @@ def estimate(
         progress: called about twice a second with (restart, iteration, loss); True for a bar.
         engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits
             the record.
+        noise: model of the errors of lagged physics one step ahead, in memory: "white",
+            `ARMA(ar, ma)` for `y = φθ + f + (C/D) e`, "arma" for `ARMA(1, 1)`, or "auto" to choose
+            the orders, white among them. Its coefficients are estimated with θ and learner by
+            prediction error. With the criterion `Auto()` one step ahead is trained.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -225,6 +233,11 @@ def estimate(
     check_type(initial, AnyFit | Model | None, "initial", "an Estimate, a Model or None")
     model = initial.model if isinstance(initial, AnyFit) else initial
     if isinstance(baseline, Motion):
+        if noise != "white":
+            raise InputError(
+                "a motion has white noise on its outputs; leave out `noise`, or fit the physics in "
+                "its lagged form."
+            )
         if lags is not None:
             raise InputError(
                 "a motion has no `lags`: its learner sees states and inputs; leave them out."
@@ -267,6 +280,7 @@ def estimate(
         "blocks": blocks,
         "initial": model,
         "engine": engine,
+        "noise": noise,
     }
     return fit(problem, learner=learner, **options)
 
@@ -289,6 +303,7 @@ def fit(
     progress: ProgressCallback = SILENT,
     engine: Engine = InMemory(),  # noqa: B008  (frozen)
     checkpoints: Checkpoints | None = None,
+    noise: Noise = "white",
 ) -> Estimate:
     """Fit a problem that is posed already; arguments as of `estimate`.
 
@@ -305,13 +320,33 @@ def fit(
     """
     _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
     _check_types(initial=initial, validation=validation)
+    options: dict[str, Any]
     learner = declared(learner)
     check_no_memory(learner)
     _check_splittable(structure, problem.baseline, learner)
+    coloured = declared_noise(noise)
+    if coloured is not None:
+        check_noise(problem, solver, structure, criterion, engine, ensemble=ensemble)
+        options = {
+            "learner": learner,
+            "structure": structure,
+            "criterion": criterion,
+            "solver": solver,
+            "regularization": regularization,
+            "restarts": restarts,
+            "seed": seed,
+            "blocks": blocks,
+            "fallback": fallback,
+            "initial": initial,
+            "validation": validation,
+            "progress": progress,
+            "engine": engine,
+        }
+        return fit_coloured(problem, coloured, fit, options)
     if criterion.automatic and _may_decide(
         problem, solver, structure, warm=initial is not None, ensemble=ensemble
     ):
-        options: dict[str, Any] = {
+        options = {
             "learner": learner,
             "structure": structure,
             "solver": solver,
@@ -349,7 +384,8 @@ def fit(
     else:
         runs = restarts * len(choices)
         check_sizes(problem, learner, iterations=solver.iterations, runs=runs, room=engine.room())
-        problem, learner, warnings = independent_terms(problem, learner)
+        if problem.noise is None:  # a fit under a noise model has left them out already
+            problem, learner, warnings = independent_terms(problem, learner)
         task = OneStepTask.of(problem, learner, engine=engine)
         starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
     solved = criterion.one_step and problem.baseline.linear

@@ -46,7 +46,7 @@ class Blocks:
     bound: Bound
 
     def __call__(self, chunk: Chunk, w: Float[Array, "nw"], before: Overlap) -> Float[Array, "n n"]:
-        values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
+        values, jacobian = chunk.derivatives(self.bound, w)
         nt, cells = chunk.q.shape[1], chunk.e.size  # outputs and rows as one axis of ny·m cells
         q = jnp.moveaxis(chunk.q, 1, 0).reshape(nt, cells)
         residual, jacobian = (chunk.e - values).reshape(cells), jacobian.reshape(-1, cells)

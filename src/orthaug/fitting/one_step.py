@@ -29,7 +29,7 @@ from orthaug.fitting.structures import Additive, Orthogonal, Structure
 from orthaug.fitting.training_rows import TrainingRows
 from orthaug.fitting.unfinished import noticeable_fall
 from orthaug.models.learners import Bound, Learner, Scaling, nothing_learned
-from orthaug.models.rows import Engine, InMemory, Overlap
+from orthaug.models.rows import Engine, InMemory, Overlap, filtered_rows
 from orthaug.models.terms import scaling_of
 from orthaug.physics.problem import Problem
 from orthaug.physics.streamed import StreamedProblem
@@ -81,10 +81,12 @@ class OneStepTask(TrainingRows):
             return cls(
                 problem, bound, scaling, unit, rms, engine, engine.draw(problem.source, row_builder)
             )
-        e = problem.unexplained / rms
-        rows = engine.build_rows(
-            scaling(z), problem.projection.q, e, np.broadcast_to(gain, (*e.shape, e.shape[1]))
-        )
+        e, q = problem.unexplained / rms, problem.projection.q
+        if problem.noise is not None:
+            weight = problem.weight.matrix / rms
+            rows: Any = filtered_rows(scaling(z), q, e, unit, problem.noise, weight)
+        else:
+            rows = engine.build_rows(scaling(z), q, e, np.broadcast_to(gain, (*e.shape, len(e.T))))
         return cls(problem, bound, scaling, unit, rms, engine, rows)
 
     @property

@@ -108,7 +108,9 @@ class TrainingRows:
                 LearnerSums(self.bound), self.rows, w, None, self._no_overlap.values
             )
             return np.asarray(sums[0]) * self.rms
-        return self.problem.projection.coordinates(self.problem.weight.rows(self.values(w)))
+        values, problem = self.values(w), self.problem
+        values = values if problem.noise is None else problem.noise.rows(values)
+        return problem.projection.coordinates(problem.weight.rows(values))
 
     def share_slope(self, w: Vector) -> Matrix:
         """Return QᵀJ (nθ, nw) of the learner with the weights w, in whitened outputs."""

@@ -35,6 +35,7 @@ from orthaug.models.rows import (
     projected_gram,
 )
 from orthaug.models.statistics import column_units, half_inverse
+from orthaug.physics.noise import RowFilter
 from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Factor
 
@@ -171,6 +172,7 @@ def joint_covariance(
         problem.rows.x,
         problem.projection.q,
         problem.weight.matrix,
+        problem.noise,
     )
     whitened = problem.weight.whitened(noise)
     bound, w = model.form.bound, np.asarray(model.numbers.weights)
@@ -194,7 +196,8 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
 
     NaN on the first lags.
 
-    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`. A new measurement adds the noise, whose
+    It is that of the fitted function, `√(ψ Cov(c, w) ψᵀ)`, ψ filtered by a noise model whose own
+    coefficients count as known. A new measurement adds the noise, whose
     covariance (ny, ny) is `model.statistics.noise`: its standard deviation is `√(std² +
     diag(noise))`.
 
@@ -217,9 +220,19 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         x = model.form.regressors(experiment, record)
         shape = chunk_shape(len(x))
         chunks = in_chunks(x, shape, repeat=True)
-        variance = np.asarray(_variances(model.form, model.numbers, chunks, root))
+        if model.coloured and model.noise is not None:
+            moved = from_chunks(
+                np.asarray(changes(model.form, model.numbers, chunks, root)), len(x)
+            )
+            moved = np.swapaxes(moved.reshape(len(x), -1, len(model.outputs)), 1, 2)
+            past = model.noise.past  # these rows have no forecast
+            filtered = RowFilter(model.noise, (len(x),)).rows(moved)
+            variance = np.sum(np.concatenate([moved[:past], filtered[past:]]) ** 2, axis=2)
+        else:
+            found = np.asarray(_variances(model.form, model.numbers, chunks, root))
+            variance = from_chunks(found, len(x))
         values = np.full((len(experiment), len(model.outputs)), np.nan)
-        values[model.form.first_row :] = np.sqrt(np.maximum(from_chunks(variance, len(x)), 0.0))
+        values[model.form.first_row :] = np.sqrt(np.maximum(variance, 0.0))
         deviations.append(values)
     return deviations
 
@@ -342,7 +355,10 @@ def row_influence(problem: Problem, model: Model, slope: Matrix) -> Float[np.nda
     rows = len(problem.rows)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(rows), repeat=True))
     moved = np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root)))
-    return from_chunks(moved, rows).reshape(rows, nt, ny)
+    found = from_chunks(moved, rows).reshape(rows, nt, ny)
+    if problem.noise is None:
+        return found
+    return np.swapaxes(problem.noise.rows(np.swapaxes(found, 1, 2)), 1, 2)
 
 
 def _correction(problem: Problem, residual: Matrix, used: float) -> float:

@@ -121,7 +121,7 @@ def _white_test(influence: Matrix, errors: Vector) -> float:
 
 
 def one_step_slopes(problem: Problem, model: Model, x: Matrix | None = None) -> Slopes:
-    """Return ∂ŷ/∂(c, w) in whitened outputs on the rows x (N, nx).
+    """Return ∂ŷ/∂(c, w) in whitened outputs on the rows x (N, nx), filtered by a noise model.
 
     By default, on the rows of the problem.
     """
@@ -134,6 +134,8 @@ def one_step_slopes(problem: Problem, model: Model, x: Matrix | None = None) -> 
         np.asarray(changes(model.form, model.numbers, chunks, jnp.diag(unit))), len(x)
     )
     slopes = moved.reshape(len(x), len(unit), ny) / unit[:, None]
+    if problem.noise is not None:
+        slopes = np.swapaxes(problem.noise.rows(np.swapaxes(slopes, 1, 2)), 1, 2)
     return np.einsum("oi,kni->kon", problem.weight.matrix, slopes)
 
 

@@ -27,6 +27,7 @@ from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import layout_of
+from orthaug.physics.noise import NoiseModel, RowFilter
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Projection
@@ -343,15 +344,27 @@ class WeighedPhysics:
     unit: Float[np.ndarray, "M ny ny"]
     projection: Projection
     excitation: Excitation
+    noise: RowFilter | None = None
+    """The filter of a noise model, where the points are the training rows in their order."""
+
+    def times(self, values: Float[np.ndarray, "M ny ..."]) -> Float[np.ndarray, "M ny ..."]:
+        """Return values at the points in the inner product of the measure."""
+        return times(self.unit, values if self.noise is None else self.noise.rows(values))
 
 
 def weigh(
-    measure: Measure, support: Support, baseline: Baseline, outputs: tuple[str, ...], weight: Matrix
+    measure: Measure,
+    support: Support,
+    baseline: Baseline,
+    outputs: tuple[str, ...],
+    weight: Matrix,
+    noise: NoiseModel | None = None,
 ) -> WeighedPhysics:
     """Return the physics over a measure's points.
 
     Args:
         weight: the matrix of the output weights, (ny, ny).
+        noise: filters the training rows; points of other measures have no order in time.
 
     Raises:
         InputError: a measure that does not fit the data, or on whose points the physics is not
@@ -372,9 +385,14 @@ def weigh(
             "or a uniform one over a box where it is."
         )
     unit = np.sqrt(points.weight)[:, None, None] * weight
+    along = None
+    if noise is not None and measure == Training():
+        first = largest_lag(support.layout)
+        along = RowFilter(noise, tuple(len(e) - first for e in support.record.experiments))
+        phi = along.rows(phi)
     projection = Projection.factor(times(unit, phi))
     return WeighedPhysics(
-        measure, points, unit, projection, excitation(projection.r, baseline.names)
+        measure, points, unit, projection, excitation(projection.r, baseline.names), along
     )
 
 
@@ -387,11 +405,12 @@ def weigh_problem(measure: Measure, problem: Problem) -> WeighedPhysics:
         return weigh(
             measure, Support.of(problem), problem.baseline, problem.outputs, problem.weight.matrix
         )
+    # under a noise model the factor is that of the filtered rows
     rows, own = len(problem.rows), problem.projection
     even = np.full(rows, 1 / rows)
     size = np.sqrt(even[0])
     projection = replace(own, r=own.r * size, phi=own.phi * size)
     unit = np.sqrt(even)[:, None, None] * problem.weight.matrix
     return WeighedPhysics(
-        measure, Points(problem.rows.x, even), unit, projection, problem.excitation
+        measure, Points(problem.rows.x, even), unit, projection, problem.excitation, problem.noise
     )

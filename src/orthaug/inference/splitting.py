@@ -20,7 +20,7 @@ from orthaug.models.rows import InMemory, Overlaps, chunk_shape, learner_rows
 from orthaug.models.statistics import JointCovariance
 from orthaug.models.streaming import chunks_of, sum_rows
 from orthaug.physics.excitation import require_rank
-from orthaug.physics.output_weights import times
+from orthaug.physics.noise import RowFilter
 from orthaug.physics.projection import Projection
 from orthaug.physics.streamed import RowBuilder, StreamedProblem
 
@@ -77,7 +77,8 @@ def split_by_measure(
         InputError: a measure that does not fit the model, or under which the physics is
             rank-deficient.
     """
-    weighed = weigh(measure, support, model.form.baseline, model.form.outputs, model.weight)
+    physics = (model.form.baseline, model.form.outputs, model.weight, model.noise)
+    weighed = weigh(measure, support, *physics)
     points, unit, projection = weighed.points, weighed.unit, weighed.projection
     form, numbers = model.form, model.numbers
     try:
@@ -89,12 +90,12 @@ def split_by_measure(
         raise InputError(
             f"the learner is not finite on all points of the {measure.name} measure; narrow it."
         )
-    values = times(unit, raw)
+    values = weighed.times(raw)
     aux = projection.solve_along(values, model.shared)
     theta = model.theta - model.theta_aux + aux
     covariance = slope = None
     if joint is not None and numbers.tilt is None:
-        slope = learner_slope(model, points, projection, unit)
+        slope = learner_slope(model, points, projection, unit, weighed.noise)
         covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
     size = np.linalg.norm(values)
     rest = values - projection.phi @ aux
@@ -152,17 +153,25 @@ def streamed_slope(model: Model, problem: StreamedProblem) -> Matrix:
     return problem.projection.from_coordinates(problem.projection.along(model.shared) @ overlap)
 
 
-def learner_slope(model: Model, points: Points, projection: Projection, unit: np.ndarray) -> Matrix:
+def learner_slope(
+    model: Model,
+    points: Points,
+    projection: Projection,
+    unit: np.ndarray,
+    noise: RowFilter | None = None,
+) -> Matrix:
     """Return ∂θ_aux/∂w (nθ, nw), in one pass over the points.
 
-    It is `Φ_μ⁺J_μ`, or `B(Φ_μB)⁺J_μ` along some directions.
+    It is `Φ_μ⁺J_μ`, or `B(Φ_μB)⁺J_μ` along some directions. Under a noise model, whose points are
+    rows in their order, all weights `unit` are the same.
     """
     bound, numbers = model.form.bound, model.numbers
     nt = len(model.theta)
     if not bound.size:
         return np.zeros((nt, 0))
     engine = InMemory()
-    rows = learner_rows(engine, model.form, numbers, points.x, projection.q, unit)
+    weight = unit if noise is None else unit[0]
+    rows = learner_rows(engine, model.form, numbers, points.x, projection.q, weight, noise)
     overlap = engine.sum(Overlaps(bound), rows, np.asarray(numbers.weights))
     return projection.from_coordinates(
         projection.along(model.shared) @ np.asarray(overlap.jacobian)

@@ -392,13 +392,21 @@ def last_outputs(
     states: Float[Array, "n0 m"],
     inputs: Float[Array, "T nu m"],
     steps: Any,
+    added: Float[Array, "T ny m"] | None = None,
 ) -> Parts:
-    """Return the last outputs (ny, m) of `steps` of runs side by side."""
+    """Return the last outputs (ny, m) of `steps` of runs side by side.
+
+    What is `added` to an output is in the past of the steps after it, where states are past
+    outputs.
+    """
     numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
-    states = jax.lax.fori_loop(
-        0, steps - 1, lambda i, states: side_by_side(states, inputs[i])[0], states
-    )
+
+    def advance(i: Any, states: Any) -> Any:
+        following = side_by_side(states, inputs[i])[0]
+        return following if added is None else following.at[: len(form.outputs)].add(added[i])
+
+    states = jax.lax.fori_loop(0, steps - 1, advance, states)
     return side_by_side(states, inputs[steps - 1])[1]
 
 

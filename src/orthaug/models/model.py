@@ -27,6 +27,7 @@ from orthaug.models.starts import PastOutputs, Starts
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import one_experiment, step_arguments
 from orthaug.physics.baseline import Parameter
+from orthaug.physics.noise import NoiseModel
 from orthaug.physics.parameters import PhysicalParameter
 
 if TYPE_CHECKING:
@@ -90,6 +91,8 @@ class Model(RecordModel[Form], NotebookView):
     """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
+    noise: NoiseModel | None = field(default=None, kw_only=True)
+    """The model of the errors' colour, for predictions; None where nobody asked for one."""
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
     starts: Starts = field(default=PastOutputs(), kw_only=True, repr=False)  # noqa: RUF009
@@ -167,6 +170,9 @@ class Model(RecordModel[Form], NotebookView):
         A motion's state is estimated over the `window` rows up to there; where an experiment is
         shorter than that, over fewer.
 
+        With a noise model the measured errors before it say what those on the way are likely to
+        be: then the response is the sum of physics, learner and that forecast.
+
         Args:
             record: inputs and outputs, measured.
             horizon: samples ahead, 1 or more.
@@ -178,12 +184,15 @@ class Model(RecordModel[Form], NotebookView):
         record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
-            first, parts, physics = self.starts.predict(self, experiment, record, horizon)
+            first, parts, physics, forecast = self.starts.predict(self, experiment, record, horizon)
             ahead = trajectory(parts, experiment, experiment.outputs, first)
             if physics is not None:
                 known = np.full(experiment.outputs.shape, np.nan)
                 known[first:] = np.where(np.isfinite(physics), physics, np.nan)
                 ahead = _with_physics(ahead, known)
+            if forecast is not None:
+                ahead = replace(ahead, whole=ahead.model.copy())
+                ahead.model[first:] += forecast
             trajectories.append(ahead)
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 

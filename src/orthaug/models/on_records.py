@@ -15,6 +15,7 @@ from orthaug.data.record import Channel, Experiment, Preparation, Record, same_s
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
+from orthaug.physics.noise import NoiseModel
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
 
@@ -36,6 +37,12 @@ class RecordModel(Generic[Form]):
     deviation: Vector
     weight: Matrix
     prepared: tuple[Preparation, ...]
+    noise: NoiseModel | None
+
+    @property
+    def coloured(self) -> bool:
+        """Whether a noise model forecasts errors."""
+        return self.noise is not None and not self.noise.white
 
     @property
     def learns(self) -> bool:

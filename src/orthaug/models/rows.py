@@ -23,6 +23,7 @@ from orthaug._base.parallel import Heard, Threads, in_threads, nobody
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
+from orthaug.physics.noise import FilterRows, RowFilter
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
 # Rows: so few take less time than to compile for their number, or for that of a fold
@@ -43,6 +44,22 @@ class Chunk(NamedTuple):
     """P⊥Y, what the physics cannot express."""
     gain: Float[Array, "*k ny ny m"]
     """Matrices that turn the learner's outputs into whitened rows."""
+    noise: FilterRows | None = None
+    """The filter of a noise model, after the gain; then all rows are one chunk."""
+
+    def learned(self, values: Float[Array, "ny m"]) -> Float[Array, "ny m"]:
+        """Return the learner's outputs as whitened rows."""
+        rows = jnp.sum(self.gain * values, axis=1)
+        return rows if self.noise is None else self.noise.apply(rows)
+
+    def derivatives(
+        self, bound: Bound, w: Any
+    ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
+        """Return F and J, the learner's values and their derivatives by the weights."""
+        values, jacobian = bound.jacobian(w, self.z, self.gain)
+        if self.noise is None:
+            return values, jacobian
+        return self.noise.apply(values), self.noise.apply(jacobian)
 
 
 class Overlap(NamedTuple):
@@ -292,15 +309,40 @@ def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
     return columns @ columns.T
 
 
+def filtered_rows(
+    z: Matrix, q: Any, e: Matrix, unit: Any, noise: RowFilter, weight: Matrix
+) -> Chunk:
+    """Return all rows as one chunk in memory, under a noise model.
+
+    Args:
+        unit: of the learner's outputs, (ny,).
+        weight: matrix (ny, ny) of the filtered outputs.
+    """
+    gain = np.broadcast_to(np.diag(unit), (*e.shape, e.shape[1]))
+    chunk = build_chunk(z, q, e, gain, chunk_shape(len(z), max(len(z), 1)))
+    chunk = chunk._replace(noise=noise.for_engine(chunk.e.shape[-1], weight))
+    return jax.tree.map(jax.device_put, chunk)
+
+
 def learner_rows(
-    engine: Engine, form: LaggedDynamics, numbers: Numbers, x: Matrix, q: Any, weight: Any
+    engine: Engine,
+    form: LaggedDynamics,
+    numbers: Numbers,
+    x: Matrix,
+    q: Any,
+    weight: Any,
+    noise: RowFilter | None = None,
 ) -> Any:
     """Return regressors x (N, nx) as rows of the engine.
 
-    Outputs are multiplied by `weight`, (ny, ny) or (N, ny, ny).
+    Outputs are filtered by the noise model, and multiplied by `weight`, (ny, ny), or (N, ny, ny)
+    without a noise model.
     """
     z = np.asarray(form.features.evaluate(x, form.layout, np))
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
+    if noise is not None:
+        e = np.zeros((len(x), len(form.outputs)))
+        return filtered_rows(scaled, q, e, np.asarray(numbers.gain), noise, weight)
     gain = np.broadcast_to(weight * np.asarray(numbers.gain), (len(x), *2 * (len(form.outputs),)))
     return engine.build_rows(scaled, q, np.zeros(gain.shape[:2]), gain)
 
@@ -312,7 +354,7 @@ class Overlaps:
     bound: Bound
 
     def __call__(self, chunk: Chunk, w: Any) -> Overlap:
-        values, jacobian = self.bound.jacobian(w, chunk.z, chunk.gain)
+        values, jacobian = chunk.derivatives(self.bound, w)
         return Overlap(
             jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values)
         )
@@ -348,7 +390,7 @@ class _LeftOver:
 def _columns(bound: Bound, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
     """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
-    jacobian = bound.jacobian(w, chunk.z, chunk.gain)[1]
+    jacobian = chunk.derivatives(bound, w)[1]
     for overlap in overlaps:
         jacobian = jacobian - jnp.einsum("tw,tom->wom", overlap, q)
     return q, jacobian
@@ -382,7 +424,7 @@ def _values(bound: Bound, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m
 
     def member_values(w: Any) -> Any:
         values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
-        return jnp.sum(chunk.gain * values, axis=1)
+        return chunk.learned(values)
 
     if tilt is None:
         return member_values(w)

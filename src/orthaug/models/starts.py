@@ -38,6 +38,8 @@ class Predicted(NamedTuple):
     first: int
     parts: Parts
     physics: Matrix | None = None
+    forecast: Matrix | None = None
+    """Errors that a noise model expects there."""
 
 
 class Starts(Protocol):
@@ -198,25 +200,44 @@ class PastOutputs:
         form = model.form
         first = form.first_row + horizon - 1
         model.check_rows(experiment, first)
+        expected = self._forecast(model, experiment, record, horizon)
+        last = None if expected is None else expected[:, -1]
         if horizon == 1 or not form.states:
-            return Predicted(
-                first, form.parts_at(model.numbers, form.regressors(experiment, record, first))
-            )
+            x = form.regressors(experiment, record, first)
+            return Predicted(first, form.parts_at(model.numbers, x), None, last)
         inputs = form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)  # (m, nu, T)
         rows = form.first_row + np.arange(len(windows))
 
-        def ahead(states: Matrix, windows: np.ndarray) -> Parts:
+        arrays: tuple[np.ndarray, ...] = (form.start(experiment.outputs, rows), windows)
+        arrays = arrays if expected is None else (*arrays, expected)
+
+        def ahead(states: Matrix, windows: np.ndarray, added: np.ndarray | None = None) -> Parts:
             """Return the last of the steps from each of the states; the windows overlap."""
             found = last_outputs(
-                form, model.numbers, states.T, np.moveaxis(windows, (0, 2), (2, 0)), horizon
+                form,
+                model.numbers,
+                states.T,
+                np.moveaxis(windows, (0, 2), (2, 0)),
+                horizon,
+                None if added is None else np.moveaxis(added, 0, -1),
             )
             return Parts(*(np.asarray(part).T for part in found))
 
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
-        return Predicted(
-            first, in_batches(ahead, (form.start(experiment.outputs, rows), windows), largest)
-        )
+        return Predicted(first, in_batches(ahead, arrays, largest), None, last)
+
+    @staticmethod
+    def _forecast(
+        model: RecordModel[LaggedDynamics], experiment: Experiment, record: Record, horizon: int
+    ) -> Float[np.ndarray, "m h ny"] | None:
+        """Return the noise model's forecasts on the way to every row; None for white noise."""
+        if not model.coloured or model.noise is None:
+            return None
+        measured = experiment.outputs[model.form.first_row :]
+        x = model.form.regressors(experiment, record)
+        errors = measured - model.form.parts_at(model.numbers, x).total
+        return model.noise.forecast_ahead(errors, horizon)
 
     def points(self, model: RecordModel[LaggedDynamics], record: Record) -> Matrix:
         """Return the measured regressors of all rows that have one."""

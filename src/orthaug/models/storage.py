@@ -34,6 +34,7 @@ from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.physics.baseline import Baseline, Parameter, Term
 from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.noise import NoiseModel
 from orthaug.physics.parameters import PhysicalParameter
 
 FORMAT = 2
@@ -249,7 +250,20 @@ def _declare_lagged(
             "constants": dict(baseline.constants),
         },
     }
-    return declared, {}, {"shared": model.shared}
+    arrays = {"shared": model.shared}
+    if model.noise is not None:
+        declared["noise"] = [list(orders) for orders in model.noise.orders]
+        arrays |= {"noise.values": model.noise.values, "noise.covariance": model.noise.covariance}
+    return declared, {}, arrays
+
+
+def _rebuild_noise(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> NoiseModel | None:
+    """Return the noise model that a file declares; None for white errors, as of older files."""
+    if "noise" not in declared:
+        return None
+    orders = tuple((int(p), int(q)) for p, q in declared["noise"])
+    noise = NoiseModel.of(orders, arrays["noise.values"])
+    return replace(noise, covariance=arrays.get("noise.covariance"))
 
 
 def _rebuild_baseline(declared: dict[str, Any], given: Any, path: Path) -> Baseline:
@@ -278,7 +292,8 @@ def _lagged_fields(
         tuple(channel["name"] for channel in declared["outputs"]),
         bound,
     )
-    return {"form": form, "shared": arrays.get("shared")}
+    noise = _rebuild_noise(declared, arrays)
+    return {"form": form, "shared": arrays.get("shared"), "noise": noise}
 
 
 def _declare_motion(
@@ -537,6 +552,9 @@ def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | N
     for name in ("tilt", "pull"):
         if getattr(numbers, name) is not None:
             yield name, getattr(numbers, name), None
+    noise = getattr(model, "noise", None)
+    if noise is not None:
+        yield "noise model", noise.values, (sum(map(sum, noise.orders)),)
     square = (outputs, outputs)
     for name, value, shape in (
         ("noise", kept.noise, square),

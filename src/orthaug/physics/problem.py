@@ -6,7 +6,7 @@ Everything that can be wrong with data and physics together is found here, witho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from orthaug.data.regressors import (
 )
 from orthaug.physics.baseline import Baseline, Parameter, derived_units
 from orthaug.physics.excitation import Excitation, excitation, require_rank
+from orthaug.physics.noise import RowFilter
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections, shared_directions
@@ -107,6 +108,8 @@ class Problem:
     weight: OutputWeights
     projection: Projection
     excitation: Excitation
+    noise: RowFilter | None = field(default=None, kw_only=True)
+    """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY."""
 
     def __repr__(self) -> str:
         lags = ", ".join(str(lag) for lag in self.layout)
@@ -193,8 +196,26 @@ class Problem:
 
     @property
     def samples(self) -> int:
-        """Rows times outputs."""
-        return self.count * len(self.outputs)
+        """Rows that the criterion counts times outputs."""
+        return self.counted * len(self.outputs)
+
+    @property
+    def counted(self) -> int:
+        """Number of rows that the criterion counts."""
+        return self.count if self.noise is None else self.noise.counted
+
+    def filtered(self, noise: RowFilter | None) -> Problem:
+        """Return the problem under a noise model; None for white errors."""
+        phi = self.baseline.on(self.rows.x, self.layout, self.outputs)[0]
+        phi = phi if noise is None else noise.rows(phi)
+        projection = Projection.factor(self.weight.rows(phi))
+        excited = excitation(projection.r, self.baseline.names)
+        return replace(self, noise=noise, projection=projection, excitation=excited)
+
+    @property
+    def unfiltered(self) -> Problem:
+        """The problem without its noise model."""
+        return self if self.noise is None else self.filtered(None)
 
     @property
     def used(self) -> tuple[Lag, ...]:
@@ -204,7 +225,7 @@ class Problem:
 
     @property
     def whitened_target(self) -> Float[np.ndarray, "N ny"]:
-        return self.weight.rows(self.target)
+        return self.weight.rows(self.target if self.noise is None else self.noise.rows(self.target))
 
     @cached_property
     def least_squares(self) -> Vector:
@@ -259,9 +280,10 @@ class Problem:
     def freedom_used(self) -> Vector:
         """Degrees of freedom (ny,) that the physics uses up in each output.
 
-        An output has the share `Σ_k ‖Q_ki‖²` of nθ.
+        An output has the share `Σ_k ‖Q_ki‖²` of nθ, and the coefficients of its noise model.
         """
-        return np.sum(self.projection.q**2, axis=(0, 2))
+        used = np.sum(self.projection.q**2, axis=(0, 2))
+        return used if self.noise is None else used + self.noise.used
 
     def for_linear_learner(self) -> Problem:
         """Return the problem for a learner that is a linear combination of its features."""
@@ -286,7 +308,10 @@ class Problem:
 
     def on(self, record: Record) -> Problem:
         """Return the problem with the same physics and features on another record."""
-        return _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
+        posed = _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
+        if self.noise is None:
+            return posed
+        return posed.filtered(replace(self.noise, lengths=posed.lengths))
 
     def weigh(self, weight: OutputWeights) -> Problem:
         """Return the problem with other output weights."""

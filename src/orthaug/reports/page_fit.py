@@ -155,6 +155,7 @@ def _parameters(result: FitResult) -> list[Any]:
     plot = interval_plot(rows)
     blocks += [plot] if plot else []
     blocks += _over_experiments(result)
+    blocks += _noise_model(result)
     causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
     if causes:
         text, more = (
@@ -173,6 +174,32 @@ def _parameters(result: FitResult) -> list[Any]:
     if result.shared is not None:
         blocks.append(Text(result.shared.text, "note"))
     return blocks + _equations(result)
+
+
+def _noise_model(result: FitResult) -> list[Any]:
+    """Return the coefficients of the noise model, and how white its innovations are."""
+    if not result.noise:
+        return []
+    caption = (
+        "The noise model D(q) v = C(q) e of the errors v: 1 + ar1 q⁻¹ + … is D, 1 + ma1 q⁻¹ + … is "
+        "C. Its coefficients were estimated with the parameters, whose intervals count that. "
+    )
+    caption += " ".join(f"{one.text}." for one in result.noise)
+    rows = [
+        [
+            one.output,
+            each.name,
+            number(each.value),
+            number(each.std, 2),
+            interval(each.ci95),
+        ]
+        for one in result.noise
+        for each in one.coefficients
+    ]
+    if not rows:
+        return [Text(caption)]
+    columns = ["output", "coefficient", "value", "standard error", "95 % interval"]
+    return [Table(caption, columns, rows)]
 
 
 def _over_experiments(result: FitResult) -> list[Any]:

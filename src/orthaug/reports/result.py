@@ -300,6 +300,28 @@ class OverExperimentsResult(Content):
     physical_parameters: list[ParameterOverExperiments] | None = None
 
 
+class CoefficientResult(Content):
+    """A coefficient of a noise model."""
+
+    name: str
+    value: Number
+    std: Number
+    ci95: Numbers | None
+
+
+class NoiseResult(Content):
+    """The noise model `D(q) v = C(q) e` of an output, and its innovations e."""
+
+    output: str
+    model: str
+    ar: Whole
+    ma: Whole
+    coefficients: list[CoefficientResult]
+    innovations_std: Number = Field(validation_alias="std")
+    white_p: Number
+    text: str
+
+
 class FitResult(ResultHeader):
     """The result of `orthaug fit`."""
 
@@ -312,6 +334,7 @@ class FitResult(ResultHeader):
             "standard_errors_by",
             "intervals",
             "over_experiments",
+            "noise",
         }
     )
 
@@ -329,6 +352,8 @@ class FitResult(ResultHeader):
     """Only of three experiments or more: intervals that hold for others like them."""
     physical_consistency: ConsistencyResult | None
     sensitivities: dict[str, ByName] | None
+    noise: list[NoiseResult] | None = None
+    """Of every output, where a noise model was asked for."""
     structure: str
     measure: str | None
     measure_detail: MeasureResult | None
