@@ -126,7 +126,7 @@ class Estimate(AnyFit):
 
     @cached_property
     def noise(self) -> tuple[OutputNoise, ...]:
-        """The noise model of each output; empty where nobody asked for one."""
+        """Return the noise model of each output; empty where nobody asked for one."""
         return noise_of(self.model, self.problem)
 
     def split(self, measure: Measure) -> Estimate:

@@ -396,16 +396,17 @@ def last_outputs(
 ) -> Parts:
     """Return the last outputs (ny, m) of `steps` of runs side by side.
 
-    What is `added` to an output is the newest part of the state that follows, as of a lagged form.
+    What is `added` to an output is in the past of the steps after it, where states are past
+    outputs.
     """
     numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
 
-    def step(i: Any, states: Any) -> Any:
+    def advance(i: Any, states: Any) -> Any:
         following = side_by_side(states, inputs[i])[0]
-        return following if added is None else following.at[: added.shape[1]].add(added[i])
+        return following if added is None else following.at[: len(form.outputs)].add(added[i])
 
-    states = jax.lax.fori_loop(0, steps - 1, step, states)
+    states = jax.lax.fori_loop(0, steps - 1, advance, states)
     return side_by_side(states, inputs[steps - 1])[1]
 
 

@@ -168,9 +168,10 @@ class Model(RecordModel[Form], NotebookView):
         """Predict each row from outputs measured up to `horizon` samples before it.
 
         A motion's state is estimated over the `window` rows up to there; where an experiment is
-        shorter than that, over fewer. With a noise model the measured errors before a row say what
-        those on the way are likely to be: then the response is the sum of physics, learner and that
-        forecast.
+        shorter than that, over fewer.
+
+        With a noise model the measured errors before it say what those on the way are likely to
+        be: then the response is the sum of physics, learner and that forecast.
 
         Args:
             record: inputs and outputs, measured.
@@ -183,8 +184,7 @@ class Model(RecordModel[Form], NotebookView):
         record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
-            predicted = self.starts.predict(self, experiment, record, horizon)
-            first, parts, physics, forecast = predicted
+            first, parts, physics, forecast = self.starts.predict(self, experiment, record, horizon)
             ahead = trajectory(parts, experiment, experiment.outputs, first)
             if physics is not None:
                 known = np.full(experiment.outputs.shape, np.nan)

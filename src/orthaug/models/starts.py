@@ -39,7 +39,7 @@ class Predicted(NamedTuple):
     parts: Parts
     physics: Matrix | None = None
     forecast: Matrix | None = None
-    """Errors that a noise model forecasts, (T, ny), to be added to the parts; None without one."""
+    """Errors that a noise model expects there."""
 
 
 class Starts(Protocol):
@@ -136,16 +136,6 @@ def _outputs_of(
     return experiment.outputs
 
 
-def _forecast(
-    model: RecordModel[LaggedDynamics], experiment: Experiment, record: Record, horizon: int
-) -> Float[np.ndarray, "m h ny"]:
-    """Return the noise model's forecasts on the way to every row that is predicted."""
-    assert model.noise is not None
-    measured = experiment.outputs[model.form.first_row :]
-    parts = model.form.parts_at(model.numbers, model.form.regressors(experiment, record))
-    return model.noise.forecast_ahead(measured - np.asarray(parts.total), horizon)
-
-
 @dataclass(frozen=True)
 class PastOutputs:
     """The state is past outputs, as they were measured: `Starts` of a lagged model."""
@@ -210,26 +200,44 @@ class PastOutputs:
         form = model.form
         first = form.first_row + horizon - 1
         model.check_rows(experiment, first)
-        forecast = _forecast(model, experiment, record, horizon) if model.coloured else None
-        last = None if forecast is None else forecast[:, -1]
+        expected = self._forecast(model, experiment, record, horizon)
+        last = None if expected is None else expected[:, -1]
         if horizon == 1 or not form.states:
-            parts = form.parts_at(model.numbers, form.regressors(experiment, record, first))
-            return Predicted(first, parts, forecast=last)
+            x = form.regressors(experiment, record, first)
+            return Predicted(first, form.parts_at(model.numbers, x), None, last)
         inputs = form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)  # (m, nu, T)
         rows = form.first_row + np.arange(len(windows))
 
+        arrays: tuple[np.ndarray, ...] = (form.start(experiment.outputs, rows), windows)
+        arrays = arrays if expected is None else (*arrays, expected)
+
         def ahead(states: Matrix, windows: np.ndarray, added: np.ndarray | None = None) -> Parts:
             """Return the last of the steps from each of the states; the windows overlap."""
-            inputs = np.moveaxis(windows, (0, 2), (2, 0))
-            added = None if added is None else np.moveaxis(added, 0, 2)
-            found = last_outputs(form, model.numbers, states.T, inputs, horizon, added)
+            found = last_outputs(
+                form,
+                model.numbers,
+                states.T,
+                np.moveaxis(windows, (0, 2), (2, 0)),
+                horizon,
+                None if added is None else np.moveaxis(added, 0, -1),
+            )
             return Parts(*(np.asarray(part).T for part in found))
 
         largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
-        arrays = (form.start(experiment.outputs, rows), windows)
-        arrays = arrays if forecast is None else (*arrays, forecast)
-        return Predicted(first, in_batches(ahead, arrays, largest), forecast=last)
+        return Predicted(first, in_batches(ahead, arrays, largest), None, last)
+
+    @staticmethod
+    def _forecast(
+        model: RecordModel[LaggedDynamics], experiment: Experiment, record: Record, horizon: int
+    ) -> Float[np.ndarray, "m h ny"] | None:
+        """Return the noise model's forecasts on the way to every row; None for white noise."""
+        if not model.coloured or model.noise is None:
+            return None
+        measured = experiment.outputs[model.form.first_row :]
+        x = model.form.regressors(experiment, record)
+        errors = measured - model.form.parts_at(model.numbers, x).total
+        return model.noise.forecast_ahead(errors, horizon)
 
     def points(self, model: RecordModel[LaggedDynamics], record: Record) -> Matrix:
         """Return the measured regressors of all rows that have one."""
