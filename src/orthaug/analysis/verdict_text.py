@@ -25,8 +25,8 @@ _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
 _BIASED = Warning(
     "sensor_noise",
-    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias: "
-    'training on the free run (focus = "simulation") has none, and a noise model ([noise] '
+    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias. "
+    'Training on the free run (focus = "simulation") has none, and a noise model ([noise] '
     'model = "auto") takes it into account.',
 )
 _INCONSISTENT = Warning(
