@@ -334,7 +334,7 @@ def imitation_before(
 
 
 def _followed_by_memory(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> set[str]:
-    """Return the parameters whose slopes a few lags of the learner's inputs follow (DESIGN F15).
+    """Return the parameters whose slopes a few lags of the learner's inputs follow.
 
     A slope is shared if it is a causal function of what the learner sees. Lags of each input are
     tried from a few samples to an integral; as many are taken as the learner has states, those that

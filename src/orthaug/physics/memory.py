@@ -1,7 +1,7 @@
 """States of the learner's own: what it remembers of the past, written as equations of the motion.
 
 A learner with N states sees `z₁ … z_N` beside its other inputs, and is added to their equations as
-it is to those of the physics (DESIGN F15):
+it is to those of the physics:
 
     ż_j = (s_j − z_j) / τ_j + g_j(s, z),    learned = g(s, z)
 
