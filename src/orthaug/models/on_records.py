@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Generic, Self, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool
@@ -23,6 +23,8 @@ WITHIN = 1e-9  # of a feature's half width: the largest of training is no extrap
 
 
 Form = TypeVar("Form", bound=Dynamics)
+# Self is nothing that run-time checks of annotations can read
+Own = TypeVar("Own", bound="RecordModel[Any]")
 
 
 class RecordModel(Generic[Form]):
@@ -50,7 +52,7 @@ class RecordModel(Generic[Form]):
         return self.form.learns
 
     @property
-    def physics_only(self) -> Self:
+    def physics_only(self: Own) -> Own:
         """The model without its learner."""
         form, whole = self.form.physics_only, cast(Any, self)
         gain = np.ones(form.bound.ny)

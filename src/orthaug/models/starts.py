@@ -8,7 +8,7 @@ which a free run over the window follows the measured outputs best.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -42,6 +42,7 @@ class Predicted(NamedTuple):
     """Errors that a noise model expects there."""
 
 
+@runtime_checkable
 class Starts(Protocol):
     """Where the state of a run comes from."""
 
