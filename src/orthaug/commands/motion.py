@@ -18,7 +18,7 @@ from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record
 from orthaug.fitting.rules import check_motion_choices, check_solver, choose_regularizations
 from orthaug.inference.measures import Measure, Support
-from orthaug.physics.memory import Memory
+from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 from orthaug.reports.result import CheckResult, MeasureResult
@@ -130,7 +130,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     def pose(self, spec: Spec, record: Record, **options: Any) -> MotionProblem:
         learner, weights = spec.declared_learner(), spec.training.output_weights
         inputs = spec.learner_inputs() if learner is not None else None
-        return pose_motion(record, self.motion, inputs, weights, Memory.of(learner), **options)
+        return pose_motion(
+            record, self.motion, inputs, weights, LearnerStates.of(learner), **options
+        )
 
     def under(self, measure: Measure, spec: Spec, problem: MotionProblem) -> Self:
         """Return the physics with the suspects of the spec; the measure is tried.

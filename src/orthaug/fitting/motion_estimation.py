@@ -43,7 +43,7 @@ from orthaug.models.rows import Engine, InMemory
 from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.models.tasks import Tasks, runs_on
-from orthaug.physics.memory import Memory
+from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import Motion
 from orthaug.physics.motion_problem import MotionProblem, pose_motion
 
@@ -69,7 +69,7 @@ def pose_for(
     check_type(learner, Learner | None, "learner", "a learner such as MLP(), or None")
     if initial is None:
         return pose_motion(
-            record, motion, declared(learner).inputs, output_weights, Memory.of(learner)
+            record, motion, declared(learner).inputs, output_weights, LearnerStates.of(learner)
         )
     motion = with_its_memory(initial, motion)
     check_initial_motion(initial, motion)

@@ -22,7 +22,7 @@ from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.models.beyond import BEYOND
-from orthaug.physics.memory import MOST_STATES, check_time_constants
+from orthaug.physics.learner_states import MOST_STATES, check_time_constants
 
 Tree = Any  # a pytree of weight arrays
 
@@ -82,7 +82,7 @@ class MLP:
             quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
             fade in a motion.
         states: states of its own, by which it remembers the past; 0 for none. Beside equations of
-            motion only (`physics.memory`).
+            motion only (`physics.learner_states`).
         time_constants: of these states [s], with which training begins; None to spread them.
 
     Examples:

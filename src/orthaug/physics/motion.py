@@ -44,7 +44,7 @@ class State:
             one, or None.
         learned: whether the learner is added to this equation.
         unit: of the state, such as "m/s".
-        memory: whether it is a state of the learner, not of the physics (`physics.memory`).
+        memory: whether it is a state of the learner, not of the physics (`physics.learner_states`).
     """
 
     name: str

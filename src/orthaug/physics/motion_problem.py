@@ -20,7 +20,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Record
-from orthaug.physics.memory import Memory, add_memory
+from orthaug.physics.learner_states import LearnerStates, add_memory
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
 from orthaug.physics.parameters import PhysicalParameter
@@ -223,7 +223,7 @@ def pose_motion(
     motion: Motion,
     learner_inputs: Sequence[str] | None = None,
     output_weights: str | Sequence[float] = "auto",
-    memory: Memory = Memory(),  # noqa: B008  (frozen)
+    memory: LearnerStates = LearnerStates(),  # noqa: B008  (frozen)
 ) -> MotionProblem:
     """Check record and motion against each other.
 

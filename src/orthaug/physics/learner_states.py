@@ -30,7 +30,7 @@ _LONGEST = 0.1  # of the longest experiment: a slower lag is seen too few times
 
 
 @dataclass(frozen=True)
-class Memory:
+class LearnerStates:
     """The states of a learner: how many, and the time constants [s] that training begins with.
 
     None for time constants spread over those that the record can show.
@@ -40,7 +40,7 @@ class Memory:
     time_constants: tuple[float, ...] | None = None
 
     @classmethod
-    def of(cls, learner: object) -> Memory:
+    def of(cls, learner: object) -> LearnerStates:
         """Return the memory that a learner declares; none of one that declares nothing."""
         return cls(getattr(learner, "states", 0), getattr(learner, "time_constants", None))
 
@@ -77,7 +77,7 @@ def names_of_memory(motion: Motion, states: int) -> tuple[str, ...]:
 
 
 def add_memory(
-    motion: Motion, inputs: Sequence[str] | None, memory: Memory, record: Record
+    motion: Motion, inputs: Sequence[str] | None, memory: LearnerStates, record: Record
 ) -> tuple[Motion, tuple[str, ...] | None]:
     """Return the motion with a learner's states, and the inputs of the learner with them.
 
