@@ -1,20 +1,35 @@
-"""Anchors of numbers in the documents: comments before a block of Markdown that say where its numbers come from.
+"""Anchors of numbers in the documents: where the numbers of a block of Markdown come from.
+
+They are entries of claims.yaml, each with a piece of the block's text that no other block of the page has:
+
+    - document: README.md
+      text: Ten initial weights
+      measured: published.picture
+      numbers: '"(#)"'
+      within: a factor 2
+    - document: docs/scale.md
+      text: Memory of a streamed fit
+      machine: python benchmarks/memory.py
+    - document: docs/noise.md
+      section: Noise models
+      stated: of the generated data
+
+`measured` names `file.function` of benchmarks/, then which numbers of the block are meant: those of a table's columns
+(`columns 2 to 7`), those at the `#` of quoted texts, or all of them; in order of appearance they are what the function
+returns. `machine` and `stated` speak of the block's other numbers: they depend on the machine, or nobody measured them.
+With `section`, a heading, they speak of all that stands below it.
+
+Whoever writes a page may put an anchor before its block first, as a comment; `python benchmarks/claims.py --collect`
+moves comments into claims.yaml:
 
     <!-- measured: output_unit.table; columns 2 to 7; within 20 % -->
-    <!-- measured: initial_states.compare; "off by # standard", "on # of # draws"; within 0.5 -->
     <!-- machine: python benchmarks/memory.py -->
-    <!-- stated: limits of the excitation check -->
-
-`measured` names `file.function` of benchmarks/, then which numbers of the block below are meant: those of a table's
-columns, those at the `#` of quoted texts, or all of them; in order of appearance they are what the function returns.
-`machine` and `stated` speak of the block's other numbers: they depend on the machine, or nobody measured them. Before
-a heading they speak of its whole section. Several anchors may stand before one block.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 ANCHOR = re.compile(r"<!-- (measured|machine|stated): (.+?) -->")
@@ -201,12 +216,92 @@ def taken(page: str, line: int, anchors: list[tuple[str, str]]) -> list[tuple[st
     return found
 
 
-def blocks(page: str, text: str) -> Iterator[Block]:
-    """The blocks of a page of Markdown, without fenced code."""
+Entry = Mapping[str, str]
+"""An entry of claims.yaml."""
+
+
+def anchor_of(entry: Entry) -> tuple[str, str]:
+    """The kind and the text of an entry's anchor, as a comment would have them."""
+    known = {"document", "text", "section", "numbers", "within"}
+    kinds = [kind for kind in ("measured", "machine", "stated") if kind in entry]
+    if (
+        len(kinds) != 1
+        or set(entry) - known - set(kinds)
+        or ("text" in entry) == ("section" in entry)
+    ):
+        raise AnchorError(
+            f"claims.yaml: {dict(entry)}: expected `document`, `text` or `section`, and one of "
+            "`measured` (with `numbers` and `within`), `machine`, `stated`."
+        )
+    parts = [entry[kinds[0]]]
+    if "numbers" in entry:
+        parts.append(entry["numbers"])
+    if "within" in entry:
+        parts.append(f"within {entry['within']}")
+    return kinds[0], "; ".join(parts)
+
+
+def entry_of(kind: str, anchor: str) -> dict[str, str]:
+    """The other way round, without document and place."""
+    first, *rest = (part.strip() for part in anchor.split(";")) if kind == "measured" else [anchor]
+    entry = {kind: first}
+    for part in rest:
+        if part.startswith("within "):
+            entry["within"] = part.removeprefix("within ")
+        else:
+            entry["numbers"] = part
+    return entry
+
+
+def collect(page: str, text: str) -> tuple[str, list[dict[str, str]]]:
+    """A page without the comments that are anchors, and these as entries of claims.yaml."""
+    found = list(blocks(page, text))
+    begins = {block.line: block for block in found}
+    kept, waiting, entries = [], [], []
+    for number, raw in enumerate(text.split("\n"), start=1):
+        line = raw.strip()
+        if anchor := ANCHOR.fullmatch(line):
+            waiting.append((anchor[1], anchor[2]))
+            continue
+        kept.append(raw)
+        if waiting and line:
+            heading = re.match(r"#+ (.+)", line)
+            place = (
+                {"section": heading[1]}
+                if heading
+                else {"text": piece_of(begins[number].text, [block.text for block in found])}
+            )
+            entries += [{"document": page, **place, **entry_of(*one)} for one in waiting]
+            waiting = []
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(kept)).lstrip("\n"), entries
+
+
+def piece_of(text: str, texts: Sequence[str]) -> str:
+    """The shortest beginning of a block, or first row of a table, that no other block of the page has."""
+    if text.startswith("|"):
+        pieces = [line for line in text.split("\n") if not line.startswith("|-")]
+    else:
+        words = text.split(" ")
+        pieces = [" ".join(words[:count]) for count in range(min(4, len(words)), len(words) + 1)]
+    for piece in pieces:
+        if sum(piece in other for other in texts) == 1:
+            return piece
+    raise AnchorError(f"'{text[:40]}': another block of the page has the same text.")
+
+
+def blocks(page: str, text: str, entries: Sequence[Entry] = ()) -> Iterator[Block]:
+    """The blocks of a page of Markdown, without fenced code, with the anchors of comments and entries."""
     anchors: list[tuple[str, str]] = []
     lines: list[str] = []
     sections: dict[int, str] = {}
     begin, fenced = 0, False
+    met = [0] * len(entries)
+
+    def beside(key: str, found: Callable[[str], bool]) -> list[tuple[str, str]]:
+        chosen = [i for i, one in enumerate(entries) if key in one and found(one[key])]
+        for i in chosen:
+            met[i] += 1
+        return [anchor_of(entries[i]) for i in chosen]
 
     def end() -> Iterator[Block]:
         if lines:
@@ -215,13 +310,14 @@ def blocks(page: str, text: str) -> Iterator[Block]:
                 if lines[0].startswith("|")
                 else re.sub(r"\s+", " ", " ".join(lines))
             )
-            yield Block(page, begin, joined, tuple(anchors), next(iter(sections.values()), None))
+            here = (*anchors, *beside("text", lambda piece: piece in joined))
+            yield Block(page, begin, joined, here, next(iter(sections.values()), None))
             lines.clear()
             anchors.clear()
 
     for number, raw in enumerate([*text.split("\n"), ""], start=1):
         line = raw.strip()
-        heading, anchor = re.match(r"(#+) ", line), ANCHOR.fullmatch(line)
+        heading, anchor = re.match(r"(#+) (.*)", line), ANCHOR.fullmatch(line)
         if line.startswith("```"):
             fenced = not fenced
         if fenced and anchors:
@@ -234,8 +330,9 @@ def blocks(page: str, text: str) -> Iterator[Block]:
             if anchor and not fenced:
                 anchors.append((anchor[1], anchor[2]))
             elif heading and not fenced:
-                level = len(heading[1])
+                level, title = len(heading[1]), heading[2]
                 sections = {above: told for above, told in sections.items() if above < level}
+                anchors += beside("section", title.__eq__)
                 if anchors:
                     sections[level] = "; ".join(told for _, told in taken(page, number, anchors))
             continue
@@ -249,3 +346,9 @@ def blocks(page: str, text: str) -> Iterator[Block]:
     yield from end()
     if anchors:
         raise AnchorError(f"{page}: the last anchor stands before nothing.")
+    for entry, count in zip(entries, met, strict=True):
+        if count != 1:
+            raise AnchorError(
+                f"{page}: {count} blocks have '{entry.get('text') or entry.get('section')}' of "
+                "claims.yaml; expected one."
+            )

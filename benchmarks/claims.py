@@ -4,8 +4,9 @@
     python benchmarks/claims.py output_unit measure    those of some files; also file.function
     python benchmarks/claims.py --list                 which there are, and how long each took last
     python benchmarks/claims.py --last                 compute nothing, compare with what was computed last
+    python benchmarks/claims.py --collect              move anchors that pages have as comments into claims.yaml
 
-Anchors in the documents say which number comes from where: see anchors.py. The exit code is 1 where one differs.
+claims.yaml says which number of which document comes from where: see anchors.py. The exit code is 1 where one differs.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from anchors import Block, Claim, blocks
+import yaml
+from anchors import AnchorError, Block, Claim, blocks, collect
 from machine import ROOT
 
 from orthaug._base.parallel import one_blas_thread
@@ -31,12 +33,38 @@ def pages() -> list[Path]:
     return [*(ROOT / name for name in named), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+def entries() -> list[dict[str, str]]:
+    """The anchors beside the documents."""
+    file = ROOT / "benchmarks" / "claims.yaml"
+    return yaml.safe_load(file.read_text(encoding="utf-8")) or [] if file.is_file() else []
+
+
 def all_blocks() -> list[Block]:
-    return [
-        block
-        for page in pages()
-        for block in blocks(page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8"))
-    ]
+    beside: dict[str, list[dict[str, str]]] = {}
+    for entry in entries():
+        beside.setdefault(entry["document"], []).append(entry)
+    found = []
+    for page in pages():
+        name = page.relative_to(ROOT).as_posix()
+        found += blocks(name, page.read_text(encoding="utf-8"), beside.pop(name, []))
+    if beside:
+        raise AnchorError(f"claims.yaml names no document of ours: {', '.join(sorted(beside))}.")
+    return found
+
+
+def move_comments() -> int:
+    """Move the anchors that pages have as comments into claims.yaml, by document; return how many there were."""
+    kept, moved = entries(), 0
+    for page in pages():
+        text, found = collect(page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8"))
+        if found:
+            page.write_text(text, encoding="utf-8")
+            kept, moved = kept + found, moved + len(found)
+    order = [page.relative_to(ROOT).as_posix() for page in pages()]
+    kept.sort(key=lambda entry: order.index(entry["document"]))
+    written = yaml.safe_dump(kept, allow_unicode=True, sort_keys=False, width=110)
+    (ROOT / "benchmarks" / "claims.yaml").write_text(written, encoding="utf-8")
+    return moved
 
 
 def all_claims() -> list[Claim]:
@@ -117,8 +145,11 @@ def chosen(names: Sequence[str]) -> dict[str, list[Claim]]:
 
 def main(arguments: Sequence[str]) -> int:
     options = {argument for argument in arguments if argument.startswith("-")}
-    if options - {"--list", "--last"}:
+    if options - {"--list", "--last", "--collect"}:
         sys.exit(__doc__)
+    if "--collect" in options:
+        print(f"{move_comments()} anchors moved into benchmarks/claims.yaml")
+        return 0
     wanted, last, met = chosen([a for a in arguments if a not in options]), stored(), True
     for name, claims in wanted.items():
         if "--list" in options:

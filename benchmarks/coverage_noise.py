@@ -170,7 +170,7 @@ def row(
     for seed in range(draws):
         made, codes, _, limits = fit(record(seed), sees, seed)
         own = np.ones(len(truth), dtype=bool)
-        if sees is not None and made.lagged:
+        if sees is not None and made.model.form.separates:
             own = np.array([False, False, True])
         elif sees is not None:
             own = np.array([name in made.shared.untouched for name in made.problem.motion.names])

@@ -1,4 +1,4 @@
-"""Runs over many rows that begin where runs over some of them ended, and runs from their own starts: docs/design.md.
+"""Runs over many rows that begin where runs over some of them ended, and runs from their own starts: docs/decisions/many_rows.md.
 
 Run: python benchmarks/many_rows.py
 """
@@ -64,7 +64,7 @@ def rows() -> Iterator[Compared]:
 
 
 def losses() -> list[float]:
-    """The ratios of docs/design.md."""
+    """The ratios of docs/decisions/many_rows.md."""
     return [row.loss for row in rows()]
 
 

@@ -14,7 +14,7 @@ from orthaug._base.jax import jax
 from orthaug._base.parallel import one_blas_thread
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segments import respond, sensitivity
-from orthaug.physics.motion_problem import pose_motion
+from orthaug.physics.problem import pose_motion
 
 REPEATS = 15
 CASES = (

@@ -17,8 +17,8 @@ from machine import describe
 from measured_sets import job
 
 import orthaug as oa
-from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import fit_motion
+from orthaug import MotionEstimate
+from orthaug.fitting.estimation import fit
 
 RIM = "h1"
 STARTS = 10
@@ -41,7 +41,7 @@ def fits(free_rim: bool, starts: int) -> list[MotionEstimate]:
         )
     options = {"learner": spec.declared_learner(), "criterion": spec.declared_criterion()}
     options |= {"solver": spec.declared_solver(), "blocks": 0, "fallback": False}
-    return [fit_motion(problem, seed=seed, **options) for seed in range(starts)]
+    return [fit(problem, seed=seed, **options) for seed in range(starts)]
 
 
 def test_errors(free_rim: bool = False, starts: int = STARTS) -> list[float]:

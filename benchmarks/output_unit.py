@@ -1,4 +1,4 @@
-"""Which unit of the learner's output to choose (F5 of docs/design.md): test RMSE for 1 to 100 residual deviations.
+"""Which unit of the learner's output to choose (docs/decisions/output_unit.md): test RMSE for 1 to 100 residual deviations.
 
 The unit is the prior under evidence regularisation, and the size of a Xavier start without. Medians over
 12 noise draws (the first is the paper's) or over initialisations. Run: python benchmarks/output_unit.py
@@ -72,7 +72,7 @@ def measured() -> dict[int, list[tuple[float, float]]]:
 
 
 def table() -> list[list[tuple[float, float]]]:
-    """The numbers of docs/design.md, without the noiseless column."""
+    """The numbers of docs/decisions/output_unit.md, without the noiseless column."""
     return [columns[:NOISELESS] + columns[NOISELESS + 1 :] for columns in measured().values()]
 
 

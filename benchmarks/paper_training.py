@@ -15,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 from machine import describe
 
-from orthaug.fitting.estimates import Estimate
+from orthaug import Estimate
 from orthaug.fitting.structures import Additive, Structure
 from orthaug.studies import published
 from orthaug.studies.common import ORTHOGONAL, STRUCTURES, train

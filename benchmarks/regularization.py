@@ -148,7 +148,7 @@ def rows() -> list[tuple[str, list[float | None]]]:
 
 
 def table() -> list[list[float | None]]:
-    """The numbers of docs/design.md."""
+    """The numbers of docs/decisions/regularization.md."""
     return [found for _, found in rows()]
 
 

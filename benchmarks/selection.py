@@ -21,7 +21,7 @@ from machine import describe
 from measured_sets import written
 
 import orthaug as oa
-from orthaug.commands.fit import score_part
+from orthaug.analysis.scoring import score_part
 from orthaug.commands.select import open_select, select_for
 from orthaug.data.terms import TermLibrary
 from orthaug.physics.problem import pose

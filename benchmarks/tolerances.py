@@ -1,4 +1,4 @@
-"""When to stop Levenberg-Marquardt, and how strongly to damp its first step: the choices of docs/design.md.
+"""When to stop Levenberg-Marquardt, and how strongly to damp its first step: the choices of docs/decisions/damping.md.
 
 Run: python benchmarks/tolerances.py
 """
@@ -53,7 +53,7 @@ def rows() -> Iterator[list[tuple[float, float]]]:
 
 
 def table() -> list[list[tuple[float, float]]]:
-    """The numbers of docs/design.md."""
+    """The numbers of docs/decisions/damping.md."""
     return list(rows())
 
 

@@ -1,4 +1,4 @@
-"""The paper's static example: ten initialisations, additive against orthogonal, and the picture of the README.
+"""The paper's static example: ten initialisations, additive against orthogonal, and the picture of docs/guide/theory.md.
 
     python examples/static_example.py [picture.png]
 

@@ -110,7 +110,7 @@ def _programs_are_let_go() -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def _defects_are_seen() -> Iterator[None]:
     """A user keeps a training behind which an analysis fails; a test fails."""
-    from orthaug.commands import attempt
+    from orthaug.analysis import attempt
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempt, "DEFECTS", ())

@@ -8,7 +8,8 @@
 - A `text` block right below is what the block prints: words as they stand, whole numbers too, other numbers to 2 % or
   a unit and a half of their last digit. `...` stands for anything.
 - Comments before a block: `<!-- given: run1.csv, record -->` is what the reader has already, made by `given.py`;
-  `<!-- exit 2 -->` is how the last command ends; `<!-- not run: why -->` leaves the block out.
+  `<!-- exit 2 -->` is how the last command ends; `<!-- not run: why -->` leaves the block out. README and the home page
+  have no comments: `BESIDE` of `given.py` has theirs.
 """
 
 from __future__ import annotations
@@ -87,6 +88,20 @@ def blocks(text: str) -> Iterator[Block]:
                     last.exits = int(comment[3])
             yield last
         comments, i = [], end + 1
+
+
+def blocks_of(path: Path) -> list[Block]:
+    """The blocks of a page, with what stands beside it where the page has no comments."""
+    found = list(blocks(path.read_text(encoding="utf-8")))
+    name = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
+    for first, text in given.BESIDE.get(name, {}).items():
+        (block,) = (one for one in found if one.text.startswith(first))
+        kind, _, told = text.partition(": ")
+        if kind == "given":
+            block.given += told.split(", ")
+        else:
+            block.not_run = told
+    return found
 
 
 def pattern(expected: str) -> tuple[str, list[str]]:
@@ -175,7 +190,7 @@ class Page:
     def __init__(self, path: Path):
         self.path = path
         self.names: dict = {"__name__": "__main__"}
-        self.blocks = list(blocks(path.read_text(encoding="utf-8")))
+        self.blocks = blocks_of(path)
 
     def printed(self, block: Block) -> str:
         """Runs a block and returns what it printed; fails where a command ends otherwise than it should."""

@@ -33,6 +33,21 @@ def file(name: str, seed: int) -> None:
     np.savetxt(name, table, delimiter=",", header="force,position", comments="", fmt="%.9g")
 
 
+def friction(_: str) -> None:
+    """Two runs of a mass of 1 kg, a spring of 100 N/m, a damper of 2 N s/m and dry friction of 4 N."""
+    for name, rows, seed in (("run1.csv", 400, 1), ("run2.csv", 200, 2)):
+        rng = np.random.default_rng(seed)
+        force, position = np.repeat(rng.uniform(-20, 20, rows // 10), 10), np.zeros(rows)
+        x = v = 0.0
+        for i in range(rows):
+            position[i] = x
+            for _ in range(200):
+                v += 1e-4 * (force[i] - 2 * v - 100 * x - 4 * np.tanh(v / 0.05))
+                x += 1e-4 * v
+        table = np.column_stack([force, position + 1e-3 * rng.normal(size=rows)])
+        np.savetxt(name, table, delimiter=",", header="force,position", comments="", fmt="%.9g")
+
+
 def record() -> oa.Record:
     u, y = measured()
     return oa.Record.from_arrays(u, y, sampling_time=0.01, inputs=["force"], outputs=["position"])
@@ -101,7 +116,14 @@ def samples() -> list[tuple[np.ndarray, np.ndarray]]:
     return [(u[k : k + 1], y[k : k + 1]) for k in range(len(u))]
 
 
-FOLDERS = {"result": result, "runs": runs}
+BESIDE = {  # pages without comments: of a block, by its first line, what is given or why it is not run
+    "README.md": {
+        "make demo": "not run: makes an environment of its own; CI runs it",
+        "[data]": "given: friction",
+    },
+    "docs/index.md": {"pip install": "not run: changes the environment that runs this test"},
+}
+FOLDERS = {"result": result, "runs": runs, "friction": friction}
 NAMES: dict[str, Callable[[], object]] = {
     "files": lambda: sorted(str(path) for path in Path("runs").glob("*.parquet")),
     "dask_frame": dask_frame,

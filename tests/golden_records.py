@@ -58,6 +58,22 @@ def mass(rows: int, seed: int, sampling_time: float = 0.01) -> pd.DataFrame:
     return pd.DataFrame({"t": time, "force": force, "position": positions + noise})
 
 
+def held_pendulum(rows: int, seed: int, sampling_time: float = 0.02) -> pd.DataFrame:
+    """Return a pendulum on its end with dry friction, held by a PD controller that acts on the noisy angle."""
+    random = np.random.default_rng(seed)
+    reference, noise = 0.3 * steps(random, rows, 30), 1e-3 * random.normal(size=rows)
+    fine, (x, v), before, found = 20, (0.0, 0.0), 0.0, np.zeros((rows, 2))
+    for k in range(rows):
+        error = reference[k] - x - noise[k]
+        torque = 20 * error + 4 * (error - before) / (0.02 + sampling_time)
+        before += sampling_time * (error - before) / (0.02 + sampling_time)
+        found[k] = x + noise[k], torque
+        for _ in range(fine):
+            v += (9 * np.sin(x) + 2 * torque - 0.8 * np.tanh(v / 0.5)) * sampling_time / fine
+            x += v * sampling_time / fine
+    return pd.DataFrame({"reference": reference, "angle": found[:, 0], "torque": found[:, 1]})
+
+
 def oscillator(rows: int, seed: int) -> pd.DataFrame:
     """Return a Duffing oscillator in the place of Silverbox, its columns and sampling time."""
     random, h = np.random.default_rng(seed), 0.001638468 / 20
@@ -144,6 +160,8 @@ def write_data(folder: Path) -> None:
         "tanks": two_outputs(240, 4),
         "mass": mass(300, 5),
         "mass_steps": mass(150, 6),
+        "pendulum": held_pendulum(300, 13),
+        "pendulum_steps": held_pendulum(150, 14),
         "flawed": flawed(spring(240, 7), 7),
         "flawed_mass": flawed(mass(300, 8), 8).drop(columns="t"),
         "experiments": experiments(80, 3),

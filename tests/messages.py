@@ -163,7 +163,7 @@ class _Groups:
         raised = [n for n in ast.walk(tree) if isinstance(n, ast.Raise) and n.exc is not None]
         calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
         for call in sorted(calls, key=lambda one: one.lineno):
-            if ast.unparse(call.func) in ("Warning", "WarningResult"):
+            if ast.unparse(call.func) == "Warning":
                 given = [*call.args, *(keyword.value for keyword in call.keywords)]
                 code = self._code(given[0])
                 for one in given[1:]:

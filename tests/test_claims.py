@@ -14,7 +14,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "benchmarks"))
 
 import claims  # noqa: E402
-from anchors import ANCHOR, AnchorError, Block, Tolerance, blocks, numbers_in  # noqa: E402
+from anchors import (  # noqa: E402
+    ANCHOR,
+    AnchorError,
+    Block,
+    Tolerance,
+    blocks,
+    collect,
+    numbers_in,
+)
 from documents import COMMENT  # noqa: E402
 
 CHEAP = ("covariance.theta_block", "design.usual")
@@ -184,6 +192,68 @@ def test_an_anchor_that_says_nothing_is_refused(text: str, message: str) -> None
         [one.claims for one in blocks("page.md", text)]
 
 
+PAGE = """# One
+
+It was 7 of 9 in 3 s.
+<!-- measured: a.b; "gave #."; within 2 -->
+It gave 5.5.
+
+<!-- machine: python x.py -->
+| a | b |
+|---|---|
+| 1 | 2 s |
+
+| a | b |
+|---|---|
+| 3 | 4 s |
+
+<!-- stated: what was tried -->
+## Two
+
+in 0.5 s
+"""
+
+
+def test_comments_become_entries_that_say_the_same() -> None:
+    text, entries = collect("page.md", PAGE)
+    assert "<!--" not in text
+    assert entries == [
+        {
+            "document": "page.md",
+            "text": "It gave 5.5.",
+            "measured": "a.b",
+            "numbers": '"gave #."',
+            "within": "2",
+        },
+        {"document": "page.md", "text": "| 1 | 2 s |", "machine": "python x.py"},
+        {"document": "page.md", "section": "Two", "stated": "what was tried"},
+    ]
+    beside = list(blocks("page.md", text, entries))
+    (claim,) = (claim for one in beside for claim in one.claims)
+    assert [number.value for number in claim.numbers] == [5.5]
+    assert claim.tolerance == Tolerance(size=2)
+    assert [bool(one.unexplained()) for one in beside] == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"text": "absent", "stated": "x"}, "0 blocks have 'absent'"),
+        ({"text": "It", "section": "Two", "stated": "x"}, "expected `document`, `text` or"),
+        ({"text": "It gave", "stated": "x", "near": "2"}, "expected `document`, `text` or"),
+        ({"text": "It gave"}, "one of `measured`"),
+        ({"text": "| a | b |", "stated": "x"}, "2 blocks have '| a | b |'"),
+        ({"section": "Three", "stated": "x"}, "0 blocks have 'Three'"),
+        ({"section": "Two", "measured": "a.b"}, "stands before a heading"),
+        ({"text": "It gave", "measured": "a.b", "numbers": '"took #"'}, 'no text "took #"'),
+    ],
+)
+def test_an_entry_that_says_nothing_is_refused(entry: dict[str, str], message: str) -> None:
+    text, _ = collect("page.md", PAGE)
+    with pytest.raises(AnchorError, match=re.escape(message)):
+        [one.claims for one in blocks("page.md", text, [{"document": "page.md", **entry}])]
+
+
 def test_a_number_that_cannot_be_measured_here_is_left_out() -> None:
     (claim,) = block("<!-- measured: a.b -->\n1.0 and 2.0").claims
     assert claims.compare(claim, [None, 2.0]) == (
@@ -193,6 +263,19 @@ def test_a_number_that_cannot_be_measured_here_is_left_out() -> None:
     assert claims.compare(claim, [None, None]) == (True, "skipped  page.md:2  a.b: no data")
     assert claims.compare(claim, [1.0, None, 2.0])[1].endswith("2 numbers in the text, 3 computed")
     assert not claims.compare(claim, [None, 2.1])[0]
+
+
+def test_comments_of_all_pages_are_moved(project, capsys) -> None:
+    page = project / "README.md"
+    before = [(one.text, one.anchors) for one in claims.all_blocks()]
+    assert claims.main(["--collect"]) == 0
+    assert capsys.readouterr().out == "2 anchors moved into benchmarks/claims.yaml\n"
+    assert "<!--" not in page.read_text()
+    assert [(one.text, one.anchors) for one in claims.all_blocks()] == before
+    assert claims.main([]) == 0
+    page.write_text(page.read_text().replace("2.0 and 3.05", "nothing"))
+    with pytest.raises(AnchorError, match="0 blocks have '2.0 and 3.05' of claims.yaml"):
+        claims.all_claims()
 
 
 @pytest.fixture

@@ -85,7 +85,10 @@ def test_a_controller_is_found(noise, gain):
     assert found.name == "u" and found.p < 0.001 and found.share > 0.02
     (warning,) = closed_loop(record)
     assert warning.code == "closed_loop" and "past y predicts u" in warning.text
-    assert "Record the reference" in warning.text and "white in the equation" in warning.text
+    assert (
+        "two stages: record the reference" in warning.text
+        and "white in the equation" in warning.text
+    )
 
 
 @pytest.mark.parametrize("rows", [3, 30, 120])

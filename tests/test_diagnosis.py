@@ -26,10 +26,10 @@ from orthaug import (
     estimate,
     synthetic,
 )
-from orthaug.analysis.inconsistency import inconsistency
+from orthaug.analysis.findings import DiagnosisResult
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.verdict_text import _shares
-from orthaug.reports.findings import DiagnosisResult
+from orthaug.fitting.inconsistency import inconsistency
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 EVIDENCE = {

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import given
 import matplotlib
 import pytest
-from documents import ROOT, Page, blocks, differences, pages
+from documents import ROOT, Page, blocks, blocks_of, differences, pages
 from sources import parsed
 
 import orthaug
@@ -20,13 +20,13 @@ from orthaug.export.kinds import TARGETS
 SOURCE = ROOT / "src" / "orthaug"
 
 PAGES = {page.relative_to(ROOT).as_posix(): page for page in pages()}
-BLOCKS = {name: list(blocks(page.read_text(encoding="utf-8"))) for name, page in PAGES.items()}
+BLOCKS = {name: blocks_of(page) for name, page in PAGES.items()}
 RUNNING = [name for name, found in BLOCKS.items() if any(block.not_run is None for block in found)]
 REFERENCE = "".join(
     page.read_text(encoding="utf-8") for page in sorted((ROOT / "docs" / "reference").glob("*.md"))
 )
 RESULTS = ("analysis", "selection", "inference")  # rooms whose classes are results
-NOT_RUN = 11
+NOT_RUN = 12
 OPTIONAL = ("casadi", "control", "dask", "distributed", "pyarrow", "sklearn")
 
 
@@ -133,6 +133,48 @@ def test_what_functions_return_is_in_the_reference():
         )
 
 
+def test_readme_and_home_page_have_no_comments_and_readme_is_short():
+    texts = {
+        name: PAGES[name].read_text(encoding="utf-8") for name in ("README.md", "docs/index.md")
+    }
+    assert {name for name, text in texts.items() if "<!--" in text} == set()
+    assert len(texts["README.md"].split()) <= 600
+    contributing = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert len(contributing.split()) <= 1200
+
+
+def test_pages_have_pictures_that_are_small_and_described():
+    """Each tutorial and the pages where people look; every picture has a function that draws it, and words."""
+    shown = {
+        name: re.findall(r"^!\[([^\]]*)\]\((\S+)\)", page.read_text(encoding="utf-8"), re.MULTILINE)
+        for name, page in PAGES.items()
+    }
+    wanted = {name for name in PAGES if re.match(r"docs/tutorials/(?!index)", name)}
+    looked_at = [
+        "result",
+        "app",
+        "selection",
+        "explain",
+        "linear",
+        "observer",
+        "export",
+        "architecture",
+    ]
+    wanted |= {"README.md", *(f"docs/{page}.md" for page in looked_at)}
+    assert {name for name in wanted if not shown[name]} == set()
+    files = {(PAGES[name].parent / path).resolve() for name in shown for _, path in shown[name]}
+    assert all(len(text) > 20 for name in shown for text, _ in shown[name])
+    assert files == set((ROOT / "docs" / "figures").iterdir())
+    assert max(file.stat().st_size for file in files) <= 60_000
+    assert sum(file.stat().st_size for file in files) <= 1_200_000
+    drawn = (ROOT / "docs" / "_site" / "figures.py").read_text(encoding="utf-8")
+    made = {
+        page.rpartition("/")[2].lower()
+        for page in re.findall(r'^@picture\("([\w/]+)"', drawn, re.M)
+    }
+    assert {file.stem for file in files} - {"app", "mpc"} <= made
+
+
 def test_every_page_is_in_the_navigation():
     nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
     told = set(re.findall(r"[\w/]+\.md\b", nav))
@@ -144,8 +186,7 @@ def test_every_warning_has_a_row_with_a_remedy():
         node
         for file in SOURCE.rglob("*.py")
         for node in ast.walk(parsed(file))
-        if isinstance(node, ast.Call)
-        and getattr(node.func, "id", "") in ("Warning", "WarningResult")
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Warning"
     ]
     first = [call.args[0] if call.args else call.keywords[0].value for call in calls]
     codes = {node.value for node in first if isinstance(node, ast.Constant)}

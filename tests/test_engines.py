@@ -302,7 +302,7 @@ def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory
 def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch):
     """Also where a witness stands for them: what the learner takes from θ is known from all, its scores are scaled."""
     whole = flown_lagged(from_files(folder))
-    monkeypatch.setattr("orthaug.fitting.estimation.witness", lambda source: witness(source, 500))
+    monkeypatch.setattr("orthaug.fitting.fit_plans.witness", lambda source: witness(source, 500))
     found = flown_lagged(opened(folder))
     assert len(found.problem.record) == 500 and found.problem.count == whole.problem.count
     np.testing.assert_allclose(found._slope(), whole._slope(), rtol=1e-6, atol=1e-9)

@@ -10,14 +10,14 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.signal import lfilter
 
+from orthaug.analysis.findings import SuspectResult
 from orthaug.analysis.independence import against_regressor
+from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.analysis.residuals import analyse
 from orthaug.reports import plots
 from orthaug.reports.biases import bias_map
 from orthaug.reports.finding_plots import bias_figure, residual_analysis_figure
-from orthaug.reports.findings import SuspectResult
 from orthaug.reports.page_figures import bias_plot, residual_plots
-from orthaug.reports.residual_tests import ResidualTestResult
 
 UNITS = {"speed": "rad/s", "voltage": "V", "current": "A"}
 

@@ -58,3 +58,15 @@ def test_the_delay_of_an_input_that_acts_by_its_square_is_found(seed):
         Record.from_arrays(u, lfilter([0, 0, 1.0], [1, -0.8], u**2) + 0.05 * rng.normal(size=600))
     )
     assert model is not None and model.delays == (2,) and model.orders.nk == (2,)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_on_the_output_of_a_slow_system_takes_no_further_lags(seed):
+    """Two slow modes: least squares needs four lags against the noise, and its run is poor."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(60.0 * rng.integers(0, 2, size=60), 25)
+    a = np.convolve([1, -0.99], [1, -0.85])
+    y = lfilter([0, 0.033, -0.0315], a, u)
+    model = first_model(Record.from_arrays(u, y + 0.01 * y.std() * rng.normal(size=1500)))
+    assert model is not None and model.orders.na == 2
+    assert model.free_run[0] < 0.03

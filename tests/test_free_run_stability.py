@@ -31,9 +31,9 @@ from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
 from orthaug.analysis import lipschitz as gradients
 from orthaug.analysis.feedback import feedback
+from orthaug.analysis.findings import StabilityResult
 from orthaug.data.regressors import stack_rows
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Parts
-from orthaug.reports.findings import StabilityResult
 
 FEW = LevenbergMarquardt(iterations=5)
 

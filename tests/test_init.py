@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 import tomllib
 
@@ -853,3 +854,29 @@ def test_wild_samples_in_long_runs_are_left_out(tmp_path):
     ), done.err
     assert tomllib.loads((tmp_path / "spec.toml").read_text())["data"]["missing"] == "skip"
     assert run("check", tmp_path / "spec.toml").code == 0
+
+
+@pytest.mark.parametrize("level", [0.0, 5.0])
+def test_the_stated_error_is_what_a_fit_gives_on_the_same_rows(tmp_path, monkeypatch, level):
+    """Physics alone, trained one step ahead on the training rows, in free run over the test rows."""
+    monkeypatch.chdir(tmp_path)
+    u, y = plant()
+    pd.DataFrame({"u": u, "y": y + level}).to_csv("run.csv", index=False)
+    said = run(
+        "init", "run.csv", "--inputs", "u", "--outputs", "y", "--sampling-time", 0.1
+    ).out.replace("\n  ", " ")
+    stated = re.search(
+        r"its error in free run is ([\d.]+) % of the output's standard deviation on rows "
+        r"(\d+) to (\d+), fitted to rows 0 to \2 one step ahead",
+        said,
+    )
+    assert stated is not None, said
+    place = tmp_path / "spec.toml"
+    text = place.read_text(encoding="utf-8").partition("[learner]")[0]
+    spec = tomllib.loads(text)
+    assert spec["data"]["tests"]["last"]["rows"] == [int(stated[2]), int(stated[3])]
+    alone = 'kind = "none"\n[training]\nfocus = "prediction"\n'
+    place.write_text(f"{text}[learner]\n{alone}", encoding="utf-8")
+    fitted = json.loads(run("fit", "spec.toml", "--json", "--out", "out").out)
+    nrmse = fitted["scores"]["tests.last"]["simulation"]["nrmse"][0]
+    assert float(f"{100 * nrmse:.3g}") == float(stated[1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthaug import scores
-from orthaug.reports.result import ScoreResult
+from orthaug.analysis.fit_findings import ScoreResult
 
 
 def test_scores_are_their_formulas():

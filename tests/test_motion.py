@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import orthaug as oa
-from orthaug.physics.motion_problem import pose_motion
+from orthaug.physics.problem import pose_motion
 
 M = oa.PhysicalParameter("m", 2.0, "kg", min=0)
 K = oa.PhysicalParameter("k", 8.0)

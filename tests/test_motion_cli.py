@@ -688,13 +688,13 @@ def test_parameters_of_equations_without_a_learner_are_not_moved_by_what_it_sees
 
 
 def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, monkeypatch):
-    from orthaug.analysis import free_run_bias, motion_modes
+    from orthaug.analysis import physics_findings
 
     def fails(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(motion_modes, "motion_stability", fails)
-    monkeypatch.setattr(free_run_bias, "linearize_fit", fails)
+    monkeypatch.setattr(physics_findings, "motion_stability", fails)
+    monkeypatch.setattr(physics_findings, "linearize_fit", fails)
     spec = put(folder).with_name("fails.toml")
     spec.write_text(SPEC.replace("[training]", SUSPECTS))
     code, out, err = orthaug("fit", spec, "--out", folder / "fails")
@@ -712,7 +712,7 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
 
 
 def test_a_defect_of_an_analysis_loses_no_training_either(monkeypatch):
-    from orthaug.commands import attempt
+    from orthaug.analysis import attempt
 
     monkeypatch.setattr(attempt, "DEFECTS", (IndexError, ValueError))
     warnings = []

@@ -19,8 +19,8 @@ from orthaug.models.dynamics import AutodiffDynamics, Numbers
 from orthaug.models.learners import Bound, nothing_learned
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.settling import Windows, settle
+from orthaug.physics.guessed_motion import guess
 from orthaug.physics.integrators import inputs_at_points
-from orthaug.physics.motion_problem import guess
 
 TS = 0.05
 PARAMETERS = [oa.PhysicalParameter(n, v, min=0) for n, v in (("m", 1.3), ("c", 0.7), ("k", 9.0))]

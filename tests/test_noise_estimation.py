@@ -332,7 +332,7 @@ def test_warnings_speak_of_what_the_noise_model_leaves() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"noise": "innovations"}, "not available"),
+        ({"noise": "innovations"}, "is for motions"),
         ({"noise": "pink"}, "must be white, arma, auto"),
         ({"noise": "auto", "criterion": oa.Simulation()}, "one step ahead"),
         ({"noise": "auto", "criterion": oa.Prediction(3)}, "one step ahead"),
@@ -410,7 +410,7 @@ def test_a_spec_declares_it_and_the_result_has_it(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "words"),
     [
-        ('[noise]\nmodel = "innovations"\n', "is not available"),
+        ('[noise]\nmodel = "innovations"\n', "is for motions"),
         ('[noise]\nmodel = "pink"\n', "noise.model"),
         ('[noise]\nmodel = "arma"\nar = -1\n', "noise.ar"),
         ('[noise]\nmodel = "auto"\n[training]\nfocus = "simulation"\n', "one step ahead"),
@@ -423,17 +423,6 @@ def test_a_spec_that_cannot_have_it_is_bad_input(folder: Path, section: str, wor
     (folder / "bad.toml").write_text(SPEC + section)
     done = run("fit", folder / "bad.toml", "--out", folder / "bad")
     assert done.code == 2 and words in " ".join(done.err.split()), done.err
-
-
-def test_a_motion_has_none() -> None:
-    motion = oa.Motion.from_equations(
-        [oa.State("x", derivative="-p*x + u")],
-        [oa.Output("y", "x")],
-        [oa.PhysicalParameter("p", 1.0)],
-        ["u"],
-    )
-    with pytest.raises(oa.InputError, match="a motion has white noise"):
-        oa.estimate(record(0), motion, noise="auto", learner=None)
 
 
 @pytest.mark.proof

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import pydoc
 import re
 import subprocess
 import sys
@@ -17,11 +19,15 @@ from matplotlib.figure import Figure
 
 import orthaug as oa
 from orthaug import MLP
+from orthaug._base.errors import Warning
+from orthaug._base.frames import EstimateFrame
+from orthaug._base.lines import estimate_cells
 from orthaug._base.views import MAKERS
+from orthaug.analysis.findings import BiasResult
+from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.commands import bars
-from orthaug.reports.findings import BiasResult
 from orthaug.reports.html import card_of_result, html_of
-from orthaug.reports.result import FitResult, ParameterResult, WarningResult
+from orthaug.reports.result import FitResult
 
 VOID = {"br", "meta", "hr", "link", "img", "input"}
 KINDS = ("free_run", "one_step", "residuals", "learned", "parameters", "bode")
@@ -111,8 +117,57 @@ def test_physics_are_shown(baseline, motion):
 
 def test_fits_and_models_are_shown(fit):
     value = f"{fit.theta[0]:.6g}"
-    for shown in (fit, fit.model):
-        assert {"a", "b", "m/N", value} <= set(Checked(shown._repr_html_()).cells)
+    assert {"a", "b", "m/N", value} <= set(Checked(fit.model._repr_html_()).cells)
+    row = fit.parameters.loc["a"]
+    ends = (row["ci95_low"], row["ci95_high"])
+    own, std, low, high = estimate_cells(row["value"], row["std"], ends)
+    cells = {"a", "b", "m/N", own, std, f"[{low}, {high}]"}
+    assert cells <= set(Checked(fit._repr_html_()).cells)
+
+
+def test_tables_of_parameters_show_significant_digits():
+    table = EstimateFrame(
+        {"value": [9.312e-5, 100.0], "std": [1.04e-6, 0.25], "unit": ["m/N", "N/m"]},
+        index=["b", "k"],
+    )
+    for shown in (repr(table), table._repr_html_(), repr(table[["value", "std"]])):
+        assert {"9.312e-05", "1.0e-06", "100.00", "0.25"} <= set(re.split(r"[\s<>]+", shown))
+    assert table.loc["b", "value"] == 9.312e-5  # what it holds is the number in full
+
+
+def test_completion_lists_the_public_interface_alone(fit):
+    names = dir(fit)
+    assert {"predict", "simulate", "parameters", "plot", "split", "summary"} <= set(names)
+    assert not [name for name in names if name.startswith("_")] and "withheld" not in names
+    assert all(hasattr(fit, name) for name in names)
+    assert set(dir(fit.plot)) == set(KINDS)
+    assert all(getattr(fit.plot, kind).__doc__ for kind in dir(fit.plot))
+
+
+@pytest.mark.parametrize("verb", ["estimate", "select", "fit_spec", "explain", "recover"])
+def test_signatures_show_no_address(verb):
+    assert " at 0x" not in str(inspect.signature(getattr(oa, verb)))
+    assert " at 0x" not in pydoc.plain(pydoc.render_doc(getattr(oa, verb)))
+
+
+def test_fits_predict_and_simulate_as_their_model(fit, record):
+    for one, other in (
+        (fit.predict(record, 3), fit.model.predict(record, 3)),
+        (fit.simulate(record, "zero"), fit.model.simulate(record, "zero")),
+    ):
+        np.testing.assert_array_equal(one.trajectories[0].model, other.trajectories[0].model)
+
+
+def test_the_overview_has_run_residual_parameters_and_learned_part(fit, record):
+    figure = fit.plot(record)
+    shown = [axis.get_title() or axis.get_ylabel() for axis in figure.axes]
+    assert shown == [
+        "free run",
+        "residual, free run",
+        "parameters, 95 % intervals",
+        "learned part of x [m]",
+    ]
+    figure.canvas.draw()
 
 
 def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
@@ -132,10 +187,12 @@ def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
     result = FitResult.model_construct(
         parameters=[row],
         physical_parameters=None,
-        warnings=[WarningResult(code="biased", text="friction moves m")],
+        warnings=[Warning(code="biased", text="friction moves m")],
     )
     shown = html_of(card_of_result(fit, result))
-    assert {"m", "2.5", "(kg)", "[2, 3]", "0.125", "[1.9, 2.9]"} <= set(Checked(shown).cells)
+    assert {"m", "2.500", "(kg)", "[2.000, 3.000]", "0.125", "[1.900, 2.900]"} <= set(
+        Checked(shown).cells
+    )
     assert "friction moves m" in shown
 
 
@@ -313,7 +370,7 @@ def test_the_page_of_the_documents(tmp_path, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     names: dict[str, object] = {}
     matplotlib.use("agg")
-    for block in blocks[:2]:
+    for block in blocks[:4]:
         exec(block, names)
     assert Path("report.html").is_file() and names["upper"].lines
     pyplot.close("all")

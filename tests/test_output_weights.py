@@ -23,7 +23,7 @@ from orthaug import (
     load,
     save,
 )
-from orthaug.fitting.estimation import reweight
+from orthaug.fitting.fit_plans import reweight
 from orthaug.inference.covariance import joint_covariance
 
 ROWS = 300

@@ -124,7 +124,7 @@ def test_the_wheel_carries_what_tells_of_every_key():
     assert {name for name in properties if f"## [{name}]" not in keys.replace("[[", "[")} == set()
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/start.md", "docs/install.md"])
+@pytest.mark.parametrize("page", ["docs/start.md", "docs/install.md"])
 def test_every_extra_is_told(page):
     extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
     told = set(

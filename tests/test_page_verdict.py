@@ -4,33 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
-from orthaug.reports.fields import WarningResult
-from orthaug.reports.findings import (
+from orthaug._base.errors import Warning
+from orthaug.analysis.changes import Change
+from orthaug.analysis.findings import (
     AdviceResult,
     AdviceTrialsResult,
     BiasResult,
-    ChangeResult,
     DiagnosisResult,
     ValidationResult,
 )
+from orthaug.analysis.fit_findings import ParameterResult, PartScores, ScoreResult, StatusResult
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
-from orthaug.reports.result import (
-    CompareResult,
-    DataResult,
-    FitResult,
-    ParameterResult,
-    PartScores,
-    RowResult,
-    ScoreResult,
-    StatusResult,
-)
+from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
 
 DATA = DataResult(train=[], tests={"far": []})
 STATUS = StatusResult(
     code="converged", message="", iterations=1, seconds=0.0, loss=0.0, start_loss=0.0
 )
-LEARNER = ChangeResult(kind="learner", what="a learner", fall=0.3, of="simulation", output=None)
-LAG = ChangeResult(kind="input_lag", what="u[k-4]", fall=0.1, of="simulation", output=None)
+LEARNER = Change(kind="learner", what="a learner", fall=0.3, of="simulation", output=None)
+LAG = Change(kind="input_lag", what="u[k-4]", fall=0.1, of="simulation", output=None)
 KNOWN = ParameterResult(name="a", unit="", initial=0.0, value=1.0, std=0.01, ci95=[0.98, 1.02])
 
 
@@ -41,7 +33,7 @@ def scored(one_step: float, free_run: float) -> dict[str, PartScores]:
     return {"tests.far": PartScores(prediction=score(one_step), simulation=score(free_run))}
 
 
-def told(*changes: ChangeResult) -> DiagnosisResult:
+def told(*changes: Change) -> DiagnosisResult:
     return DiagnosisResult.model_construct(
         verdict="white", text="", changes=list(changes), missing=None
     )
@@ -80,7 +72,7 @@ def row(
         orthogonality_defect=None,
         scores=scored(0.01, error),
         residuals=None,
-        warnings=[WarningResult(code=warning, text="") for warning in warned],
+        warnings=[Warning(code=warning, text="") for warning in warned],
         learner_to_physics=None,
         validation=None if code is None else judged(code),
     )
@@ -109,7 +101,7 @@ def test_a_learner_that_was_tried_and_is_not_better_is_not_advised():
         "An option, not tried here: a learner, with which"
     )
     for code in ("no_help", "helps"):
-        fell_back = [WarningResult(code="physics_alone", text="")]
+        fell_back = [Warning(code="physics_alone", text="")]
         then = fit_verdict(fitted(residuals=both, validation=judged(code), warnings=fell_back)).then
         assert "further input lag u[k-4]" in then
     assert ": a learner, " in fit_verdict(fitted(residuals=both, validation=judged("helps"))).then
@@ -137,7 +129,7 @@ def test_what_was_tried_comes_first_and_what_was_not_is_an_option():
 
 
 def test_physics_alone_that_was_taken_for_a_learner_is_not_told_to_be_hurt_by_it():
-    fell_back = [WarningResult(code="physics_alone", text="")]
+    fell_back = [Warning(code="physics_alone", text="")]
     assert fit_verdict(fitted(validation=judged("hurts"))).level == "bad"
     found = fit_verdict(fitted(validation=judged("hurts"), warnings=fell_back))
     assert found.level == "good" and "Take physics alone" not in found.then

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthaug import Baseline, InputError, PhysicalParameter, PhysicsMap, Term
+from orthaug.analysis.fit_findings import physical_rows
 from orthaug.data.expressions import FUNCTIONS, Expression
 from orthaug.inference.physical import profile, solve
 from orthaug.physics.parameters import check_baseline, with_initial
-from orthaug.reports.result import physical_rows
 
 GAMMA = "(m + cd*Ts + ks*Ts**2)"
 EULER = {

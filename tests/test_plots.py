@@ -10,9 +10,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from orthaug import Channel, Response, Trajectory
+from orthaug.analysis.findings import SuspectResult
+from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.reports import finding_plots, plots
-from orthaug.reports.findings import SuspectResult
-from orthaug.reports.result import ParameterResult, RowResult
+from orthaug.reports.result import RowResult
 
 CHANNELS = (Channel("position", "m"), Channel("angle"))
 

@@ -19,21 +19,29 @@ from test_motion_cli import put
 
 import orthaug as oa
 from orthaug import Channel, Response, Trajectory
+from orthaug._base.errors import Warning
+from orthaug.analysis.findings import BiasResult
 from orthaug.commands.compare import compare_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
-from orthaug.reports.findings import BiasResult
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, fit_sections
-from orthaug.reports.page_runs import Run, compared_plots, error_band, pack_curve, run_plots
+from orthaug.reports.page_runs import (
+    Run,
+    compared_plots,
+    error_band,
+    pack_curve,
+    run_plots,
+    worst_window,
+)
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
-FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Residual tests", "Stability",
-       "Excitation and suspects", "Training and restarts", "Scores", "How to reproduce it"]  # fmt: skip
+FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Scores", "Residual tests",
+       "Stability", "Excitation and suspects", "Training and restarts", "How to reproduce it"]  # fmt: skip
 COMPARED = [
     "Verdict",
     "Models",
@@ -412,8 +420,7 @@ def test_the_band_holds_most_errors_of_training():
 
 
 def with_warning(fitted, code: str, text: str):
-    warning = fitted.result.warnings + [type("W", (), {"code": code, "text": text})()]
-    return type(fitted.result).model_validate({**dict(fitted.result), "warnings": warning})
+    return fitted.result.changed(warnings=[*fitted.result.warnings, Warning(code, text)])
 
 
 def test_the_verdict_is_built_from_the_findings(lagged, motion):
@@ -434,7 +441,8 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     bias = {"value": 10 * (row.std or 1.0), "cause": "square", "share": 0.9}
     biased = row.model_copy(update={"bias": type("B", (), bias)()})
     one = lagged.result.model_copy(update={"parameters": [biased]})
-    assert "the estimate of a carries a bias of 10 standard errors" in fit_verdict(one).trust
+    share = percent(10 * (row.std or 1.0) / (row.value or 1.0), signed=True)
+    assert f"a is biased by about {share}, 10 times its standard error" in fit_verdict(one).trust
     for name in ("unmodelled", "sensor_noise"):
         residuals = motion.result.residuals.model_copy(
             update={"verdict": name, "changes": [], "missing": None}
@@ -579,3 +587,31 @@ def test_a_comparison_tells_the_biases(compared):
     assert "bias" not in heads(with_bias(None))[0]
     head, cell = heads(with_bias(BiasResult(value=-0.25, cause="drag", share=0.9)))
     assert head[-1] == "bias" and cell == "−0.25"
+
+
+def test_long_runs_open_where_the_model_errs_most():
+    measured = np.sin(np.arange(3000) / 20)[:, None]
+    model = measured.copy()
+    model[1800:1900] += 0.5
+    first = worst_window(measured, model, 400)
+    assert first <= 1800 and first + 400 >= 1900
+    model[100:120] = np.inf  # a run that left all bounds does not hide the rest
+    assert worst_window(measured, np.where(np.isfinite(model), model, np.nan), 400) == first
+    model, none = model.clip(-9, 9), np.zeros_like(measured)
+    run = Trajectory(model, none, none, measured, 0)
+    response = Response((run,), None, (Channel("y", "m"),), 0.01)
+    (plot,) = run_plots([Run("train", response)], {})
+    low, high = plot.layout["xaxis"]["range"]
+    assert high - low == pytest.approx(399 * 0.01) and plot.whole == pytest.approx((0.0, 29.99))
+    assert "where the error is largest" in plot.caption
+    lost = Response((replace(run, diverged=(2500, "y")),), None, response.outputs, 0.01)
+    (plot,) = run_plots([Run("train", lost)], {})
+    low, high = plot.layout["xaxis"]["range"]
+    assert low < 25.0 < high and "where the run diverges" in plot.caption
+    short = Response(
+        (Trajectory(measured[:300], measured[:300], 0 * measured[:300], measured[:300], 0),),
+        None,
+        response.outputs,
+        0.01,
+    )
+    assert run_plots([Run("train", short)], {})[0].whole is None

@@ -151,6 +151,14 @@ def test_a_zoom_moves_every_panel_and_shows_more_of_a_long_record(browser, folde
     with Shown(browser, folder / "long.html") as page:
         plot = run_plot(page)
         curves = f"document.querySelector('{plot}').data"
+        low, high = shown_range(page, plot)
+        assert high - low == pytest.approx(0.399)  # 400 samples of 1 ms
+        button = page.locator("#free-run .whole-record").first
+        button.click()
+        until(page, f"document.querySelector('{plot}').layout.xaxis.range[1] > 99")
+        named = f"{curves}.filter(t => ['measured', 'model'].includes(t.name)).map(t => t.fill)"
+        until(page, f'JSON.stringify({named}) == \'["toself","none"]\'')  # both are seen
+        assert button.get_attribute("aria-pressed") == "true"
         assert page.evaluate(f"Math.max(...{curves}.map(t => t.x.length))") < 6000
         upper = page.locator(f"{plot} .nsewdrag").first
         upper.scroll_into_view_if_needed()
@@ -201,6 +209,16 @@ def test_the_contents_are_reached_and_followed_by_keys(browser, folder):
             page, "document.querySelector('#reproduce').getBoundingClientRect().top < innerHeight"
         )
         assert page.url.endswith("#reproduce")
+
+
+def test_folded_sections_open_by_their_link_with_whole_plots(browser, folder):
+    with Shown(browser, folder / "fit.html") as page:
+        folded = page.locator("#residuals > .folded")
+        assert folded.get_attribute("open") is None
+        page.locator("nav a[href='#residuals']").click()
+        until(page, "document.querySelector('#residuals > .folded').open")
+        inside = "[...document.querySelectorAll('#residuals .plot')]"
+        until(page, f"{inside}.every(p => p.layout.width === p.clientWidth && p.clientWidth > 0)")
 
 
 def test_a_change_of_theme_colours_the_curves_anew(browser, folder):

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 
 from orthaug import InputError
 from orthaug.analysis.independence import against_input, against_regressor
+from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.analysis.residuals import analyse
 from orthaug.fitting.whiteness import (
     autocorrelation,
@@ -19,7 +20,6 @@ from orthaug.fitting.whiteness import (
     normality,
     whitening_filter,
 )
-from orthaug.reports.residual_tests import ResidualTestResult
 
 RECORDS, ROWS, WARM_UP = 2000, 1000, 300
 # Of 2000 records that a test at 1 % may reject; ± 0.0022 is one standard deviation

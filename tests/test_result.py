@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,12 +15,16 @@ import numpy as np
 import pytest
 from test_cli import MLP, SPEC, make_project, run
 
-from orthaug.reports.fields import Content, Flag, Number, Numbers, Whole
-from orthaug.reports.result import DataResult, FitResult, ParameterResult, ScoreResult
+from orthaug._base.content import Content, Flag, Number, Numbers, Whole
+from orthaug.analysis.fit_findings import ParameterResult, ScoreResult
+from orthaug.reports.result import DataResult, FitResult
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
-COMMANDS = ["fit", "check", "compare", "split", "design", "select", "explain", "linearize", "track"]
+COMMANDS = [
+    *("fit", "check", "compare", "split", "design", "recover", "select", "explain", "linearize"),
+    *("track", "error"),
+]
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "result.md"
 
 
@@ -103,6 +109,28 @@ def test_what_json_cannot_hold_is_null():
     assert Each.model_validate_json(each.to_json()) == each
 
 
+def test_a_null_in_place_of_a_number_is_read_as_not_a_number():
+    @dataclass(frozen=True)
+    class Inner:
+        p: float
+        name: str
+
+    class Outer(Content):
+        inner: list[Inner]
+        found: Inner | None
+
+    made = Outer(inner=[Inner(0.5, "a"), Inner(math.inf, "b")], found=Inner(np.float64("nan"), "c"))
+    assert made.content() == {
+        "inner": [{"p": 0.5, "name": "a"}, {"p": None, "name": "b"}],
+        "found": {"p": None, "name": "c"},
+    }
+    read = Outer.from_json(made.to_json())
+    assert read.inner[0] == made.inner[0] and math.isnan(read.inner[1].p)
+    assert read.found is not None and math.isnan(read.found.p)
+    with pytest.raises(ValueError, match="name"):
+        Outer.from_json('{"inner": [{"p": 1.0}], "found": null}')
+
+
 def test_a_score_that_no_output_has_is_null_as_a_whole():
     class Given(NamedTuple):
         rmse: Any = np.array([0.5, np.nan])
@@ -129,7 +157,7 @@ def written(tmp_path_factory) -> str:
 
 
 def test_what_was_written_can_be_read(written):
-    result = FitResult.model_validate_json(written)
+    result = FitResult.from_json(written)
     assert result.to_json() + "\n" == written
     assert result.parameters[0].name == "a" and result.scores["train"].prediction.rmse
 
@@ -158,7 +186,7 @@ def test_the_schema_has_what_was_written(written):
 
 def test_the_schema_of_another_command_is_refused():
     done = run("schema", "simulate")
-    known = "fit, check, compare, split, design, select, explain, linearize, track, spec, keys"
+    known = ", ".join((*COMMANDS[:-1], "benchmark", "error", "spec", "keys"))
     assert done.code == 2 and f"must be one of {known}; got 'simulate'" in done.err
 
 

@@ -244,6 +244,14 @@ def test_columns_without_names_are_numbered(tmp_path, content, names, expected):
     np.testing.assert_array_equal([table.columns[name] for name in names], expected)
 
 
+def test_a_column_with_an_empty_cell_in_the_header_is_named_by_its_place(tmp_path):
+    path = put(tmp_path, "run.csv", '"r",,"u",,"x6",\n1,2,3,4,5,\n6,7,8,9,10,\n')
+    assert values(path, "x2", "u", "x4", "x6") == [[2, 7], [3, 8], [4, 9], [5, 10]]
+    for name in ("x1", "x3", "x7"):  # named otherwise, or not there
+        with pytest.raises(InputError, match=f"no column '{name}'"):
+            read_table(path, [name])
+
+
 def test_a_row_of_a_file_without_header_is_named_by_its_line(tmp_path):
     path = put(tmp_path, "run.txt", "# only a remark\n1 2\n3 x\n")
     table = read_table(path, ["x1", "x2"])

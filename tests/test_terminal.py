@@ -5,16 +5,19 @@ from __future__ import annotations
 import io
 import logging
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from test_cli import SPEC, make_project, run
+from typer.main import get_command
 
-from orthaug._base.lines import WIDTH, fit_screen, fold, table
+from orthaug._base.lines import WIDTH, estimate_cells, fit_screen, fold, table
 from orthaug._base.progress import LOG, show_log
-from orthaug.commands import bars, streams
+from orthaug.commands import bars, program, streams
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -61,8 +64,32 @@ def test_help_cuts_no_line_of_a_command(monkeypatch):
     assert "..." not in told and len(told.splitlines()) > 15
 
 
+def test_every_command_is_in_one_group_and_has_an_example_that_it_accepts():
+    group = get_command(program.app)
+    assert sorted(name for names in program.GROUPS.values() for name in names) == sorted(
+        group.commands  # type: ignore[attr-defined]
+    )
+    for name, command in group.commands.items():  # type: ignore[attr-defined]
+        head, _, example = str(command.epilog).partition(": ")
+        words = shlex.split(example)
+        assert (head, words[:2]) == ("Example", ["orthaug", name])
+        command.make_context(name, words[2:])  # an option or argument that is not there raises
+
+
+def test_help_says_the_default_of_every_option_with_a_value():
+    group = get_command(program.app)
+    for name, command in group.commands.items():  # type: ignore[attr-defined]
+        shown = " ".join(run(name, "--help").out.split())
+        for option in command.params:
+            if option.opts[0].startswith("--") and not (option.is_flag or option.required):
+                entry = re.split(rf" {option.opts[0]} ", shown)[1]
+                entry = re.split(r" --[a-z]", entry)[0]
+                assert "default:" in entry, f"{name} {option.opts[0]}"
+
+
 @pytest.mark.parametrize(("columns", "most"), [(80, 80), (200, 100), (0, 100), (20, 40)])
 def test_lines_fit_a_terminal_that_is_narrower(columns, most, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
     screen = io.StringIO()
     screen.isatty, screen.fileno = lambda: True, lambda: 1  # type: ignore[method-assign]
     monkeypatch.setattr(os, "get_terminal_size", lambda number: os.terminal_size((columns, 24)))
@@ -77,6 +104,47 @@ def test_lines_fit_a_terminal_that_is_narrower(columns, most, monkeypatch):
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     streams.prepare()
     assert fold([words]) == fold([words], WIDTH)
+
+
+@pytest.mark.parametrize(("columns", "most"), [("80", 80), ("60", 60), ("none", WIDTH)])
+def test_columns_hold_in_pipes(columns, most, project, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    try:
+        streams.prepare()
+        folded = fold([" ".join(["word"] * 60)])
+        assert most - len("word ") < max(map(len, folded)) <= most
+        for command in (
+            ["check", "plant.toml"],
+            ["compare", "plant.toml", "--out", "c", "--force"],
+        ):
+            monkeypatch.chdir(project)
+            done = run(*command)
+            wide = [line for line in done.out.splitlines() if len(line) > most]
+            assert done.code == 0 and not wide, wide
+    finally:
+        fit_screen(0)
+
+
+def test_tables_leave_columns_out_by_rank():
+    rows = [["name", "value", "initial", "unit"], ["stiffness", "1.5", "2", "N/m"]]
+    assert table(rows, 40, drop=["initial", "unit"])[0] == "name       value  initial  unit"
+    assert table(rows, 24, drop=["initial", "unit"]) == [
+        "name       value  unit",
+        "stiffness    1.5  N/m",
+    ]
+    assert table(rows, 17, drop=["initial", "unit"])[0] == "name       value"
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "ends"),
+    [(1.0, 0.1, (0.8, 1.2)), (9.3e-5, 1e-6, (9.1e-5, 9.5e-5)), (1e9, 1e4, (0.99e9, 1.01e9))],
+)
+def test_value_and_interval_have_equal_decimals_that_show_the_standard_error(value, std, ends):
+    shown, spread, *limits = estimate_cells(value, std, ends)
+    decimals = {text.partition("e")[0].partition(".")[2] for text in (shown, *limits)}
+    assert len({len(part) for part in decimals}) == 1
+    assert abs(float(shown) - value) < 0.06 * std and float(spread) == pytest.approx(std, rel=0.06)
+    assert [float(text) for text in limits] == pytest.approx(ends, abs=0.06 * std)
 
 
 def test_sentences_and_cells_go_on_in_the_next_line():

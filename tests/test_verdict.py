@@ -20,6 +20,7 @@ from orthaug import (
     Term,
     estimate,
 )
+from orthaug.analysis.findings import ValidationResult
 from orthaug.analysis.validation import (
     Extrapolation,
     Trial,
@@ -34,7 +35,6 @@ from orthaug.analysis.validation import (
 from orthaug.data.regressors import stack_rows
 from orthaug.fitting.held_out import held_out_blocks
 from orthaug.fitting.status import Ending
-from orthaug.reports.findings import ValidationResult
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 

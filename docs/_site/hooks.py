@@ -80,7 +80,7 @@ def on_config(config):
 def boost(uri: str) -> float:
     """How much a page counts in the search: what shows how to do something comes before lists of names."""
     room = uri.partition("/")[0]
-    return {"reference": 0.2, PLACE: 0.1, "design.md": 0.3, "notation.md": 0.3}.get(room, 3.0)
+    return {"reference": 0.2, PLACE: 0.1, "decisions": 0.3, "notation.md": 0.3}.get(room, 3.0)
 
 
 def on_page_markdown(markdown: str, page, config, files: Files) -> str:

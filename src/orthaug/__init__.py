@@ -11,6 +11,7 @@ import lazy_loader
 from orthaug._base.views import MAKERS
 
 __version__ = "0.1.0"
+_COLUMNS = 80  # of findings that are printed
 
 
 def _html(shown: Any) -> str:
@@ -31,6 +32,24 @@ def _report(fit: Any, path: Any, tests: Any) -> Any:
     return (page_of_spec if hasattr(fit, "job") else page_of)(fit, path, tests)
 
 
+def _diagnose(fit: Any, **asked: Any) -> Any:
+    from orthaug.analysis.evidence import Evidence
+    from orthaug.analysis.examination import examine
+
+    return examine(fit, Evidence.of(fit, **asked)).findings
+
+
+def _findings(fit: Any, findings: Any, *, html: bool) -> str:
+    from orthaug._base.lines import narrow_screen
+    from orthaug.reports.html import card_of_result, html_of
+    from orthaug.reports.text import fit_text
+
+    if html:
+        return html_of(card_of_result(fit, findings))
+    with narrow_screen(_COLUMNS):
+        return fit_text(fit, findings) or fit.status.message
+
+
 def _progress() -> Any:
     from orthaug.commands.bars import shown_progress
 
@@ -38,5 +57,6 @@ def _progress() -> Any:
 
 
 MAKERS.update(html=_html, plot=_plot, report=_report, progress=_progress)
+MAKERS.update(diagnose=_diagnose, findings=_findings)
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,6 +18,7 @@ from .analysis.motion_response import substep_bias as substep_bias
 from .commands import fit_spec as fit_spec
 from .commands import load_spec as load_spec
 from .commands.library import compare as compare
+from .commands.library import recover as recover
 from .data import Channel as Channel
 from .data import Detrend as Detrend
 from .data import Experiment as Experiment
@@ -50,6 +51,7 @@ from .fitting import estimate as estimate
 from .fitting import orthogonalize as orthogonalize
 from .fitting.narx import AugmentedNARX as AugmentedNARX
 from .fitting.noise import ARMA as ARMA
+from .fitting.noise import Innovations as Innovations
 from .fitting.regressor import AugmentedRegressor as AugmentedRegressor
 from .fitting.solvers import AdamLBFGS as AdamLBFGS
 from .fitting.structures import BaselinePenalty as BaselinePenalty
@@ -77,6 +79,7 @@ from .models.learners import EquinoxModule as EquinoxModule
 from .models.learners import External as External
 from .models.learners import Function as Function
 from .physics import Baseline as Baseline
+from .physics import Controller as Controller
 from .physics import Motion as Motion
 from .physics import Output as Output
 from .physics import Parameter as Parameter
@@ -85,6 +88,8 @@ from .physics import PhysicsMap as PhysicsMap
 from .physics import State as State
 from .physics import Term as Term
 from .physics import identifiability as identifiability
+from .physics.fmu import FMU as FMU
+from .physics.mechanisms import MuJoCo as MuJoCo
 from .physics.systems import HammersteinWiener as HammersteinWiener
 from .physics.systems import System as System
 from .reports import plot as plot

@@ -90,16 +90,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f", did you mean '{close[0]}'?" if close else ""
 
 
-def check_count(value: Any, name: str, least: int = 1, *, of: str = "") -> int:
-    """Return `value` if it is a whole number of at least `least`, otherwise raise InputError.
+def check_count(
+    value: Any, name: str, least: int = 1, *, most: int | None = None, of: str = ""
+) -> int:
+    """Return `value` if it is a whole number from `least` to `most`, otherwise raise InputError.
 
-    `of` names what is counted in the message.
+    Without `most` it has no upper limit; `of` names what is counted in the message.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
         counted = f" of {of}" if of else ""
-        raise InputError(
-            f"`{name}` must be a whole number{counted}, {least} or more; got {show(value)}."
-        )
+        reach = f", {least} or more" if most is None else f" from {least} to {most}"
+        raise InputError(f"`{name}` must be a whole number{counted}{reach}; got {show(value)}.")
     return int(value)
 
 

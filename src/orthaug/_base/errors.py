@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 LONGEST = 60  # characters of a name or value in a message
 _FEW = 4  # entries of an array that is shown
@@ -69,6 +71,11 @@ class InputError(ValueError):
     The text says what is there and what was expected. The command line exits with 2.
     """
 
+    code: ClassVar[str] = "input_invalid"
+    """For programs, in words_with_underscores; each kind of error has its own."""
+    in_result = False
+    """Whether the result that was printed as JSON says it already."""
+
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
 
@@ -83,6 +90,8 @@ class KeyedError(InputError):
             less than 2`.
     """
 
+    code = "value_invalid"
+
     def __init__(self, text: str, key: str, words: str) -> None:
         super().__init__(text)
         self.key, self.words = key, words
@@ -91,34 +100,69 @@ class KeyedError(InputError):
         return type(self), (str(self), self.key, self.words)
 
 
+class MissingFileError(InputError):
+    """A file or folder that is to be read is not there."""
+
+    code = "file_not_found"
+
+
+class SpecError(InputError):
+    """A spec file that is no TOML, or has unknown keys, missing keys or wrong values."""
+
+    code = "spec_invalid"
+
+
+class OutputError(InputError):
+    """A file or folder that cannot be written, or that holds what is not orthaug's."""
+
+    code = "output_refused"
+
+
 class MissingColumnError(InputError):
     """A data file lacks a column or variable that is asked for."""
+
+    code = "column_not_found"
 
 
 class MissingSampleError(InputError):
     """A data file has a cell without a sample where every cell must have one."""
 
+    code = "sample_missing"
+
 
 class RankError(InputError):
     """The physics columns are linearly dependent on the data; names the parameters involved."""
+
+    code = "rank_deficient"
 
 
 class PrecisionError(InputError, ImportError):
     """The environment forbids double precision."""
 
+    code = "no_double_precision"
+
 
 class TrainingError(ArithmeticError):
     """Training produced no finite model. The command line exits with 1."""
+
+    code: ClassVar[str] = "training_failed"
+    in_result = False
+    """Whether the result that was printed as JSON says it already."""
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
 
 
-class Warning(NamedTuple):  # noqa: A001  (the field's word; Python's own is never meant here)
+@dataclass(frozen=True)
+class Warning:  # noqa: A001  (the field's word; Python's own is never meant here)
     """A `code` for programs, in words_with_underscores, and a sentence for people."""
 
     code: str
     text: str
+
+    def __iter__(self) -> Iterator[str]:
+        """Return code and text in turn, so that `dict(fit.warnings)` has the texts by codes."""
+        return iter((self.code, self.text))
 
     def __str__(self) -> str:
         return self.text

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from orthaug import __version__
-from orthaug._base.errors import InputError
+from orthaug._base.errors import InputError, OutputError
 
 MANIFEST = "manifest.json"
 _PARTIAL, _OLD = ".orthaug-partial-", ".orthaug-old-"
@@ -166,12 +166,12 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
     try:
         there = folder.exists() or folder.is_symlink()
         if there and not folder.is_dir():
-            raise InputError(f"{folder}: not a folder; give another name.")
+            raise OutputError(f"{folder}: not a folder; give another name.")
         mine = not_ours(folder) if there and not force else None
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror}).") from None
+        raise OutputError(f"{folder}: cannot be written ({error.strerror}).") from None
     if mine is not None:
-        raise InputError(
+        raise OutputError(
             f"{folder}: holds {mine}; give another folder, or replace all of it with --force."
         )
     if there:
@@ -180,11 +180,13 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
         _check_no_one_lives_there(folder)
     ancestor = _nearest_ancestor(folder)
     if not ancestor.is_dir():
-        raise InputError(f"{folder}: cannot be written; {ancestor} is not a folder.")
+        raise OutputError(f"{folder}: cannot be written; {ancestor} is not a folder.")
     try:
         Path(tempfile.mkdtemp(prefix=".orthaug-", dir=ancestor)).rmdir()
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror} in {ancestor}).") from None
+        raise OutputError(
+            f"{folder}: cannot be written ({error.strerror} in {ancestor})."
+        ) from None
 
 
 def remember(folder: Path) -> None:
@@ -197,7 +199,7 @@ def _check_parts_writable(folder: Path) -> None:
     """Raise InputError where a folder below could not be removed."""
     for place, _, _ in os.walk(folder):
         if not os.access(place, os.W_OK | os.X_OK):
-            raise InputError(f"{folder}: cannot be written (Permission denied in {place}).")
+            raise OutputError(f"{folder}: cannot be written (Permission denied in {place}).")
 
 
 def _check_no_one_lives_there(folder: Path) -> None:
@@ -208,7 +210,7 @@ def _check_no_one_lives_there(folder: Path) -> None:
     place = os.path.realpath(folder)
     for taken, what in ((os.getcwd(), "working folder"), (os.path.expanduser("~"), "home folder")):
         if Path(os.path.realpath(taken)).is_relative_to(place):
-            raise InputError(f"{folder}: is or holds the {what}; give another folder.")
+            raise OutputError(f"{folder}: is or holds the {what}; give another folder.")
 
 
 @contextmanager
@@ -239,7 +241,7 @@ def whole_folder(folder: Path, *, force: bool = False) -> Iterator[Path]:
             _put_in_place(partial, place)
             PARTIALS.mark_placed(partial, folder)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
     finally:
         if partial is not None and os.path.lexists(partial):
             PARTIALS.discard(partial)
@@ -271,25 +273,25 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
     """Raise InputError where a file could not be written, or would replace one without force."""
     try:
         if path.is_dir() or not path.name:
-            raise InputError(f"{path}: is a folder; expected the name of a file.")
+            raise OutputError(f"{path}: is a folder; expected the name of a file.")
         if path.is_file() and not force:
-            raise InputError(f"{path}: exists; give another name, or replace it with --force.")
+            raise OutputError(f"{path}: exists; give another name, or replace it with --force.")
         if path.exists():
             return
         target = Path(os.path.realpath(path))
         if target.is_symlink():
-            raise InputError(f"{path}: is a link to itself; give another name.")
+            raise OutputError(f"{path}: is a link to itself; give another name.")
         if not target.parent.is_dir():
-            raise InputError(f"{path}: cannot be written; there is no folder {path.parent}.")
+            raise OutputError(f"{path}: cannot be written; there is no folder {path.parent}.")
         if not os.access(target.parent, os.W_OK | os.X_OK):
-            raise InputError(f"{path}: cannot be written (Permission denied in {path.parent}).")
+            raise OutputError(f"{path}: cannot be written (Permission denied in {path.parent}).")
         os.stat(target.parent / target.name)
     except FileNotFoundError:
         return
     except InputError:
         raise
     except (OSError, ValueError) as error:  # such as a NUL byte in the name
-        raise InputError(
+        raise OutputError(
             f"{path}: cannot be written ({getattr(error, 'strerror', None) or error})."
         ) from None
 
@@ -329,9 +331,9 @@ def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Itera
             f"{path}: exists and holds something else; give another name, or replace it with "
             "--force."
         )
-        raise InputError(text) from None
+        raise OutputError(text) from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
     finally:
         if partial is not None and os.path.lexists(partial):
             PARTIALS.discard(partial)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 WIDTH = 100  # columns of what is printed, at most
 _NARROWEST = 40  # below, folded tables are harder to read than lines that the terminal breaks
 _screen = [WIDTH]
 _LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
 _LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
+INTERVAL_HEAD = "95 % interval"  # of the column of intervals
 _GAP = "  "
+_NUMBER = re.compile(r"(?:[-+−<]? ?[\d.]+(?:e[-+]?\d+)?(?: %)?|–|inf|)")  # a cell of figures
+MOST_DIGITS = 15  # of a number in double precision
+_LEAST_DIGITS = 3  # of a value with a standard error
+_SMALL, _LARGE = -4, 7  # powers of ten between which a number is written without one
 
 
 def fit_screen(columns: int) -> None:
@@ -22,9 +29,25 @@ def fit_screen(columns: int) -> None:
     _screen[0] = min(WIDTH, max(columns, _NARROWEST)) if columns > 0 else WIDTH
 
 
+@contextmanager
+def narrow_screen(columns: int) -> Iterator[None]:
+    """Let what is printed within fit so many columns, or the terminal where that has fewer."""
+    before = _screen[0]
+    _screen[0] = min(before, columns)
+    try:
+        yield
+    finally:
+        _screen[0] = before
+
+
 def plural(number: int, thing: str) -> str:
     """Return `1 sample`, `2 samples`."""
     return f"{number} {thing}" + ("" if number == 1 else "s")
+
+
+def cut(text: str, most: int) -> str:
+    """Return at most so many characters of a text, with … where it is longer."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def percent(share: float, digits: int = 2, *, sign: str = "") -> str:
@@ -55,28 +78,118 @@ def plain_number(value: float, digits: int = 2, *, sign: str = "") -> str:
     return f"{rounded:{sign}.0f}" if 100 <= abs(rounded) < 1e7 else text
 
 
-def table(rows: Sequence[Sequence[str]], width: int | None = None) -> list[str]:
+def digits_for(value: float | None, spread: float | None, least: int) -> int:
+    """Return the digits of a value that show two of its spread, but at least `least`.
+
+    Examples:
+        >>> digits_for(1.45951, 9e-6, 5), digits_for(1.45951, 0.1, 5)
+        (8, 5)
+    """
+    if not value or not spread or not math.isfinite(value / spread):
+        return least
+    return min(max(least, math.ceil(math.log10(abs(value / spread))) + 2), MOST_DIGITS)
+
+
+def estimate_cells(
+    value: float | None,
+    std: float | None = None,
+    ends: Sequence[float | None] | None = None,
+) -> list[str]:
+    """Return a value, its standard error and the two ends of its interval, with equal decimals.
+
+    They have as many as show two digits of the standard error (of a quarter of the interval where
+    there is none), and a common power of ten where one is needed. A dash stands for no number.
+
+    Examples:
+        >>> estimate_cells(0.4716983, 0.000341, (0.4710287, 0.4723671))
+        ['0.471698', '0.000341', '0.471029', '0.472367']
+        >>> estimate_cells(4.761e-05, 1.8e-8, (4.7575e-05, 4.7646e-05))
+        ['4.76100e-05', '1.8e-08', '4.75750e-05', '4.76460e-05']
+        >>> estimate_cells(100.0)
+        ['100', '–', '–', '–']
+    """
+    low, high = map(_finite, (None, None) if ends is None else ends)
+    value, std = _finite(value), _finite(std)
+    known = [abs(x) for x in (value, low, high) if x is not None]
+    scale = max(known, default=0.0)
+    spread = std or ((high - low) / 4 if low is not None and high is not None else None)
+    if not spread or not scale:
+        return [*("–" if x is None else f"{x:.6g}" for x in (value, std, low, high))]
+    power = math.floor(math.log10(scale))
+    decimals = digits_for(scale, spread, _LEAST_DIGITS) - 1 - power
+    if _SMALL <= power < _LARGE:
+        form = f".{max(decimals, 0)}f"
+        return ["–" if x is None else f"{x:{form}}" for x in (value, std, low, high)]
+
+    def scaled(x: float | None) -> str:
+        return "–" if x is None else f"{x / 10.0**power:.{decimals + power}f}e{power:+03d}"
+
+    return [scaled(value), "–" if std is None else f"{std:.1e}", scaled(low), scaled(high)]
+
+
+def estimate_rows(
+    estimates: Iterable[tuple[float | None, float | None, Sequence[float | None] | None]],
+) -> list[list[str]]:
+    """Return for each value, standard error and interval its three cells, intervals aligned.
+
+    Examples:
+        >>> estimate_rows([(2.0, 0.5, (1.0, 3.0)), (-10.0, 1.0, (-12.0, -8.0))])
+        [['2.00', '0.50', '[  1.00,  3.00]'], ['-10.00', '1.00', '[-12.00, -8.00]']]
+    """
+    rows = [estimate_cells(*estimate) for estimate in estimates]
+    wide = [max((len(row[i]) for row in rows), default=0) for i in (2, 3)]
+    return [
+        [value, std, "–" if low == high == "–" else f"[{low:>{wide[0]}}, {high:>{wide[1]}}]"]
+        for value, std, low, high in rows
+    ]
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def table(
+    rows: Sequence[Sequence[str]], width: int | None = None, drop: Sequence[str] = ()
+) -> list[str]:
     """Return rows of cells as lines of at most `width` columns, the first row the head.
 
-    `width` None is that of the screen.
+    `width` None is that of the screen. Columns of numbers are aligned on the right.
 
-    Rows may be of different lengths. Columns that do not fit are below, under the first column
-    again; an interval stays beside its value.
+    Rows may be of different lengths. Columns that do not fit are left out in the order of `drop`,
+    their heads. Others are below, under the first column again; an interval stays beside its value.
 
     Examples:
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]])
-        ['part  RMSE   FIT %', 'test  0.1 m  90']
+        ['part  RMSE   FIT %', 'test  0.1 m     90']
         >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]], width=12)
-        ['part  RMSE', 'test  0.1 m', '', 'part  FIT %', 'test  90']
+        ['part  RMSE', 'test  0.1 m', '', 'part  FIT %', 'test     90']
+        >>> table([["part", "RMSE", "FIT %"], ["test", "0.1 m", "90"]], width=12, drop=["RMSE"])
+        ['part  FIT %', 'test     90']
     """
-    count = max(len(row) for row in rows)
+    count, most = max(len(row) for row in rows), width or _screen[0]
     whole = [[*row, *[""] * (count - len(row))] for row in rows]
-    widths = [max(len(row[i]) for row in whole) for i in range(count)]
+    for head in drop:
+        if sum(_widths(whole)) + len(_GAP) * (len(whole[0]) - 1) <= most:
+            break
+        whole = [[row[i] for i, name in enumerate(whole[0]) if name != head] for row in whole]
+    widths = _widths(whole)
+    right = [
+        i > 0 and all(_NUMBER.fullmatch(row[i]) for row in whole[1:]) for i in range(len(widths))
+    ]
     lines: list[str] = []
-    for block in _blocks(whole[0], widths, width or _screen[0]):
+    for block in _blocks(whole[0], widths, most):
         lines += [""] if lines else []
-        lines += [_GAP.join(row[i].ljust(widths[i]) for i in block).rstrip() for row in whole]
+        lines += [
+            _GAP.join(
+                row[i].rjust(widths[i]) if right[i] else row[i].ljust(widths[i]) for i in block
+            ).rstrip()
+            for row in whole
+        ]
     return lines
+
+
+def _widths(rows: Sequence[Sequence[str]]) -> list[int]:
+    return [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
 
 
 def _blocks(head: Sequence[str], widths: Sequence[int], width: int) -> list[list[int]]:

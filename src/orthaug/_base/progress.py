@@ -46,7 +46,7 @@ def _ignore_progress(run: int, iteration: int, loss: float) -> None:
     """Ignore the progress of all runs."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Progress:
     """Callback of `(run, iteration, loss)`.
 
@@ -65,6 +65,13 @@ class Progress:
     iterations: int = 0
     plan: Callable[[int, Plan], None] = _ignore_plan
     """Called with the number of the first run of a fit, and with its plan."""
+
+    def __repr__(self) -> str:
+        """Return `SILENT`, as signatures show it, or the names of its callbacks."""
+        if self == Progress():
+            return "SILENT"
+        named = getattr(self.report, "__qualname__", type(self.report).__name__)
+        return f"Progress({named}, runs={self.runs}, iterations={self.iterations})"
 
     def __call__(self, run: int, iteration: int, loss: float) -> None:
         self.report(self.runs + run, self.iterations + iteration, loss)

@@ -14,7 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-MAKERS: dict[str, Callable[..., Any]] = {}  # html, plot, report, progress
+MAKERS: dict[str, Callable[..., Any]] = {}  # html, plot, report, progress, diagnose, findings
 
 
 class NotebookView:
@@ -29,11 +29,67 @@ class FitView(NotebookView):
 
     @property
     def plot(self) -> Any:
-        """Figures on matplotlib axes, such as `fit.plot.free_run()`.
+        """Figures on matplotlib axes, such as `fit.plot.free_run()`; `fit.plot()` is an overview.
 
         `orthaug.reports.FitPlots` lists them.
         """
         return MAKERS["plot"](self)
+
+    def diagnose(
+        self,
+        *,
+        validation: Any = None,
+        tests: Any = None,
+        suspects: Any = (),
+        physics: Any = None,
+        profiles: bool = False,
+        blocks: int | None = None,
+        skip: int = 0,
+    ) -> Any:
+        """Return everything that `orthaug fit` says of a fit: what it is worth, and why.
+
+        Print it for the text of the command. Nothing is fitted to other data, but physics alone
+        and blocks of the training data are, where these judge the learner.
+
+        Args:
+            validation: a record that was not fitted; None for the one that `estimate` chose by.
+            tests: further records by their names, to score and judge the model on.
+            suspects: terms that the physics may lack, a `Suspect` or `MotionSuspect` each.
+            physics: from physical parameters to θ of lagged physics, a `PhysicsMap`.
+            profiles: whether physical parameters get profile-likelihood intervals, too.
+            blocks: of cross-validation of the learner, 0 for none; None for 4 where no record is
+                held out.
+            skip: leading samples of each held-out experiment that are not scored.
+
+        Returns:
+            The `Findings`: `parameters` with their biases and intervals, `scores`, `residuals`,
+            `unexplained`, `bias` by suspects, `stability`, `validation` with the verdict on the
+            learner, `warnings` with their codes; `content()` is what result.json has.
+
+        Raises:
+            InputError: records, suspects or a map that do not fit the model.
+
+        Examples:
+            >>> import numpy as np
+            >>> import orthaug as oa
+            >>> u = np.random.default_rng(0).uniform(-1, 1, 300)
+            >>> noise = 0.05 * np.random.default_rng(1).normal(size=300)
+            >>> record = oa.Record.from_arrays(u, 2 * u + u**3 + noise)
+            >>> gain = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
+            >>> found = oa.estimate(record, gain, learner=None).diagnose()
+            >>> found.residuals.verdict, [warning.code for warning in found.warnings]
+            ('unmodelled', ['unexplained'])
+        """
+        return MAKERS["diagnose"](
+            self,
+            validation=validation,
+            tests=tests,
+            suspects=suspects,
+            physics=physics,
+            profiles=profiles,
+            blocks=blocks,
+            skip=skip,
+        )
 
     def report(self, path: Any = None, *, tests: Any = None) -> Any:
         """Return the page that `orthaug fit` writes, with all figures in one file.

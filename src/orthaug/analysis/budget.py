@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import singledispatch
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -41,7 +42,8 @@ from orthaug.analysis.mapped_bias import physical_with_bias
 from orthaug.analysis.measure_bias import linearization_of
 from orthaug.analysis.suspects import MotionSuspect, Suspect, check_motion_suspects
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.inference.measures import Measure, Training
 from orthaug.physics.parameters import PhysicsMap
 
@@ -157,7 +159,7 @@ class BudgetTerms(TermPhysics, Protocol):
 
 
 def bias_budget(
-    fit: Estimate | MotionEstimate,
+    fit: Estimate,
     suspects: Sequence[Suspect | MotionSuspect] = (),
     *,
     physics: PhysicsMap | None = None,
@@ -198,36 +200,47 @@ def bias_budget(
         >>> budget.cause.suspect.name, round(budget.of("gain").value, 1)  # θ took 0.6 of the cubic
         ('cubic', 0.6)
     """
-    check_type(fit, Estimate | MotionEstimate, "fit", "what estimate returns")
-    wanted = Suspect if isinstance(fit, Estimate) else MotionSuspect
-    for suspect in suspects:
-        check_type(
-            suspect,
-            wanted,
-            "suspects",
-            f"a sequence of {wanted.__name__}, as the fit's physics requires",
-        )
-    if isinstance(fit, Estimate):
-        return _lagged_budget(fit, cast(Any, suspects), physics=physics, measure=measure)
+    check_type(fit, Estimate, "fit", "what estimate returns")
+    return _budget(fit, suspects, physics, measure)
+
+
+@singledispatch
+def _budget(
+    fit: Estimate,
+    suspects: Sequence[Any],
+    physics: PhysicsMap | None,
+    measure: Measure | None,
+) -> Budget | None:
+    """Return `bias_budget` of a kind of physics."""
+    raise NotImplementedError
+
+
+@_budget.register(MotionEstimate)
+def _of_motion(
+    fit: MotionEstimate,
+    suspects: Sequence[Any],
+    physics: PhysicsMap | None,
+    measure: Measure | None,
+) -> Budget | None:
+    _check_suspects(suspects, MotionSuspect)
     for name, given in (("physics", physics), ("measure", measure)):
         if given is not None:
             raise InputError(
                 f"`{name}` does not apply to a fit of equations of motion; leave it out."
             )
-    declared = cast("Sequence[MotionSuspect]", suspects)
-    check_motion_suspects(declared, fit.problem)
+    check_motion_suspects(suspects, fit.problem)
     terms = linearize_fit(fit)
-    return None if terms is None else budget_on(terms, declared)
+    return None if terms is None else budget_on(terms, suspects)
 
 
-def _lagged_budget(
-    fit: Estimate,
-    suspects: Sequence[Suspect],
-    *,
+@_budget.register(LaggedEstimate)
+def _of_lagged(
+    fit: LaggedEstimate,
+    suspects: Sequence[Any],
     physics: PhysicsMap | None,
     measure: Measure | None,
 ) -> Budget | None:
-    """Return `bias_budget` of a fit of difference equations."""
+    _check_suspects(suspects, Suspect)
     if not fit.status.ok or fit.model.structure != "orthogonal" or not fit.learns:
         return None
     measure = Training() if measure is None else measure
@@ -237,6 +250,13 @@ def _lagged_budget(
             f"`measure` is the {measure.name} measure, but θ was split under the {name} measure."
         )
     return budget_on(linearization_of(fit, measure, physics), suspects)
+
+
+def _check_suspects(suspects: Sequence[Any], wanted: type) -> None:
+    """Raise InputError for suspects of another kind of physics."""
+    required = f"a sequence of {wanted.__name__}, as the fit's physics requires"
+    for suspect in suspects:
+        check_type(suspect, wanted, "suspects", required)
 
 
 def budget_on(

@@ -163,6 +163,7 @@ class Catalogue:
             return MotionSuspect(name, text, place)
 
         names, features = motion.names_of_states, list(dict.fromkeys(features))
+        hidden = {*names, *motion.inputs} - {*motion.visible}
         more = [text for text in features if text not in (*names, *motion.inputs)]
         arguments = [
             *(Argument(name, row, _STATE) for name, row in zip(names, x.T, strict=True)),
@@ -171,7 +172,7 @@ class Catalogue:
         ]
         return cls(
             tuple(motion.states[place].name for place in usual_places(motion)),
-            tuple(argument for argument in arguments if np.ptp(argument.values) > 0),
+            tuple(a for a in arguments if np.ptp(a.values) > 0 and a.text not in hidden),
             tuple(Argument(text, evaluate(text)) for text in features[:_MOST_ARGUMENTS]),
             (),  # no products of states: a motion's families and usual terms have sufficed
             of_kind,

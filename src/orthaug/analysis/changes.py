@@ -25,7 +25,7 @@ from orthaug.analysis.residuals import rms_errors
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_matrix
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.models.response import Response, Trajectory
 from orthaug.physics.shared import seen_columns
 
@@ -96,7 +96,7 @@ def fall_of(share: float) -> float:
 
 
 def model_changes(
-    fit: Estimate,
+    fit: LaggedEstimate,
     response: Response,
     *,
     simulates: bool,
@@ -123,7 +123,7 @@ def model_changes(
         return found or Candidates(fit, response, simulates, skip).changes(functions)
 
 
-def own_share(fit: Estimate, one_step: Response) -> Share:
+def own_share(fit: LaggedEstimate, one_step: Response) -> Share:
     """Return the share of the one-step residual that the physics' own columns explain.
 
     It is zero where the columns were fitted to that residual.
@@ -142,7 +142,7 @@ class Candidates:
     With `own` there are only those of the physics.
     """
 
-    fit: Estimate
+    fit: LaggedEstimate
     response: Response
     simulates: bool
     skip: int

@@ -60,8 +60,39 @@ def feedback_in(record: Record) -> tuple[Feedback, ...]:
     return tuple(found)
 
 
-def closed_loop(record: Record) -> tuple[Warning, ...]:
-    """Return a warning where inputs follow outputs: what that does to estimates, and what to do."""
+_PAIR = "`controller` and the reference as input"
+_FREE_RUN = (
+    "A free run on the measured input is then consistent only with complete physics and white "
+    "noise on the sensor: "
+)
+_TWO_STAGE = (
+    "in two stages: record the reference, fit the input on it, then the plant on that simulated "
+    "input"
+)
+_REMEDIES = {
+    "direct": "One step ahead is then consistent only with complete physics and noise that is "
+    'white in the equation: else its bias remains. Give `noise.model = "arma"` (direct), or '
+    f"estimate {_TWO_STAGE}.",
+    "noise": "One step ahead with a noise model is consistent here, with complete physics and "
+    "enough orders of the noise (direct).",
+    "free run": f"{_FREE_RUN}disturbances that are fed back bias it. Estimate one step ahead with "
+    f'`noise.model = "arma"` (direct), or {_TWO_STAGE}.',
+    "motion": f"{_FREE_RUN}disturbances that are fed back bias it. Give {_PAIR}, which simulates "
+    f"the loop. If the controller is unknown, estimate {_TWO_STAGE}.",
+    "loop": "It is then no reference but the output of another controller: join that to "
+    "`controller`, with its own reference as the input.",
+}
+"""What feedback does to an estimate, and what is consistent, by the method of estimation."""
+
+
+def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
+    """Return a warning where inputs follow outputs: what that does to estimates, and what to do.
+
+    Args:
+        record: whose inputs are tested.
+        method: of estimation: "direct" (one step ahead), "noise" (with a noise model), "free run"
+            of lagged physics, "motion", or "loop" for a motion with its controller.
+    """
     found = feedback_in(record)
     if not found:
         return ()
@@ -71,12 +102,7 @@ def closed_loop(record: Record) -> tuple[Warning, ...]:
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
         f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
-        "were probably recorded under feedback. An estimate is then consistent only with "
-        "complete physics and the right noise: white in the equation for one step ahead, white "
-        "on the sensor for the free run. Otherwise noise and missing physics that are fed back "
-        "appear as an effect of the input. Record the reference and model the loop with it as "
-        "the input, make the reference much larger than the noise, or record without the "
-        "controller."
+        f"were probably recorded under feedback. {_REMEDIES[method]}"
     )
     return (Warning("closed_loop", text),)
 

@@ -15,16 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import check_type
+from orthaug._base.checks import Matrix, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
-from orthaug.analysis.inconsistency import inconsistency
 from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
@@ -43,7 +43,9 @@ from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.inconsistency import inconsistency
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.inference.covariance import by_experiment
@@ -73,7 +75,7 @@ _UNCOUNTED = " Intervals cover noise only: missing physics may have moved the pa
 
 
 def diagnose(
-    fit: Estimate | MotionEstimate,
+    fit: Estimate,
     *,
     one_step: Response | None = None,
     free_run: Response | None = None,
@@ -81,7 +83,8 @@ def diagnose(
     """Analyse the residuals of a fit on its training data; None where they cannot be tested.
 
     Lagged physics is tested one step ahead and on the free run; a motion on its free run, since its
-    states are not measured, with a test of the terms that its equations could lack (`missing`).
+    states are not measured, with a test of the terms that its equations could lack (`missing`);
+    under a noise model of innovations on these.
 
     Args:
         one_step: the prediction of the training data, if it is there already; likewise their
@@ -100,36 +103,55 @@ def diagnose(
         >>> diagnose(oa.estimate(record, gain, learner=None)).verdict
         'unmodelled'
     """
-    check_type(fit, Estimate | MotionEstimate, "fit", "an Estimate")
-    if isinstance(fit, Estimate):
-        return _of_lagged(fit, one_step, free_run)
-    if not fit.status.ok:
-        raise InputError(f"`fit` has no model: {fit.status.message}.")
-    own = fit.model.simulate(fit.problem.record) if free_run is None else free_run
-    return _of_motion(fit, own)
+    check_type(fit, Estimate, "fit", "an Estimate")
+    return _diagnosis(fit, one_step, free_run)
 
 
-def _of_motion(fit: MotionEstimate, free_run: Response) -> Diagnosis | None:
+@singledispatch
+def _diagnosis(
+    fit: Estimate, one_step: Response | None, free_run: Response | None
+) -> Diagnosis | None:
+    """Return the diagnosis of a kind of physics."""
+    raise NotImplementedError
+
+
+def _states(fit: MotionEstimate) -> list[Matrix]:
+    """Return the states (N, nx) of every experiment: of the free run, or of the predictor."""
+    record = fit.problem.record
+    if fit.model.coloured:
+        numbers = fit.model.numbers
+        c = np.asarray(numbers.theta - numbers.theta_aux)
+        return fit.segmented.states_by_row(c, numbers.weights, fit.states)
+    frame = fit.model.states(record)
+    ends = np.cumsum([len(e) for e in record.experiments])[:-1]
+    return np.split(frame[list(fit.problem.motion.names_of_states)].to_numpy(), ends)
+
+
+@_diagnosis.register(MotionEstimate)
+def _of_motion(
+    fit: MotionEstimate, one_step: Response | None, free_run: Response | None
+) -> Diagnosis | None:
     """Return the diagnosis by the free run's errors on the training data.
 
     None where it ran away, or leaves rounding only.
-
-    Args:
-        free_run: of the training data.
     """
+    if not fit.status.ok:
+        raise InputError(f"`fit` has no model: {fit.status.message}.")
+    if fit.model.coloured:  # a free run of what process noise moved leaves more than innovations
+        free_run = one_step or fit.model.predict(fit.problem.record)
+    free_run = fit.model.simulate(fit.problem.record) if free_run is None else free_run
     record, motion = fit.problem.record, fit.problem.motion
     if any(run.diverged for run in free_run.trajectories):
         return None
     if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
         return None
     errors, every = errors_of(free_run), -(-len(record) // _MOST_ROWS)
-    inputs = [e.inputs for e in record.experiments]
-    frame = fit.model.states(record)
-    ends = np.cumsum([len(e) for e in record.experiments])[:-1]
-    states = np.split(frame[list(motion.names_of_states)].to_numpy(), ends)
+    firsts = [run.start for run in free_run.trajectories]
+    inputs = [e.inputs[first:] for e, first in zip(record.experiments, firsts, strict=True)]
+    states = [own[first:] for own, first in zip(_states(fit), firsts, strict=True)]
     if not np.isfinite(np.concatenate(states)).all():
         return None
-    names = ([c.name for c in record.outputs], list(motion.inputs), list(motion.names_of_states))
+    names = ([c.name for c in record.outputs], list(motion.external), list(motion.names_of_states))
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
         shares = tuple(_predictable(i, test, errors, inputs, every) for i, test in enumerate(tests))
@@ -189,8 +211,9 @@ def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: 
     )
 
 
+@_diagnosis.register(LaggedEstimate)
 def _of_lagged(
-    fit: Estimate, one_step: Response | None, free_run: Response | None
+    fit: LaggedEstimate, one_step: Response | None, free_run: Response | None
 ) -> Diagnosis | None:
     """Return the diagnosis of lagged physics by its one-step residual and its free run.
 
@@ -275,7 +298,9 @@ def _conclude(seen: Finding) -> Diagnosis:
     )
 
 
-def _inconsistent(fit: Estimate, one_step: Response, free_run: Response | None) -> Warning | None:
+def _inconsistent(
+    fit: LaggedEstimate, one_step: Response, free_run: Response | None
+) -> Warning | None:
     """Return the warning that coloured errors move the one-step θ.
 
     None where they do not, as far as is seen.
@@ -310,7 +335,9 @@ def _is_small(seen: Finding) -> bool:
     return max(shares) < _SMALL and small
 
 
-def _effects(fit: Estimate, one_step: Response, free_run: Response | None, simulates: bool) -> dict:
+def _effects(
+    fit: LaggedEstimate, one_step: Response, free_run: Response | None, simulates: bool
+) -> dict:
     """Return the predictable shares of the minimised error, and the changes that would use them."""
     response, skip = (free_run, fit.criterion.washout) if simulates else (one_step, 0)
     several = fit.criterion.free_run is not None and not fit.criterion.simulates
@@ -372,7 +399,7 @@ def _accounts(problem: Problem, free_run: Response, skip: int) -> bool:
     )
 
 
-def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
+def _physics_runs(fit: LaggedEstimate) -> list[tuple[Response, int]]:
     """Return the free run of the physics alone, trained on the free run; with the rows to skip."""
     problem, criterion = fit.problem, Simulation()
     longest = max(len(e) for e in problem.record.experiments) - fit.model.form.first_row
@@ -387,7 +414,7 @@ def _physics_runs(fit: Estimate) -> list[tuple[Response, int]]:
     return [] if any(t.diverged for t in run.trajectories) else [(run, criterion.washout)]
 
 
-def _lags_of(fit: Estimate) -> Lags | None:
+def _lags_of(fit: LaggedEstimate) -> Lags | None:
     """Return the lags that a baseline function needs; terms know their own."""
     if fit.problem.baseline.function is None:
         return None

@@ -32,12 +32,12 @@ from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respon
 from orthaug.analysis.robustness import block_of
 from orthaug.analysis.suspects import MotionSuspect, check_motion_suspects
 from orthaug.fitting.field_points import field_under
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import reach
 from orthaug.inference.linearization import Linearization
-from orthaug.inference.motion_split import (
+from orthaug.inference.splitting import (
     Field,
     MotionSplit,
     learned_places,
@@ -367,9 +367,9 @@ def suspected_bias(fit: MotionEstimate, suspects: Sequence[MotionSuspect]) -> li
 def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
     """Return the linearization of a fitted motion under the measure that it was split under.
 
-    None where it has no normal equations.
+    None where it has no normal equations, or where the gain of a predictor would move with them.
     """
-    if not fit.status.ok or fit.scores is None:
+    if not fit.status.ok or fit.scores is None or fit.model.coloured:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit

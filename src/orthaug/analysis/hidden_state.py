@@ -288,7 +288,7 @@ class _OfStates:
         """Return states and inputs, and what the learner sees beside them."""
         form = self.form
         names = (*form.motion.names_of_states, *form.motion.inputs)
-        found = dict(zip(names, np.concatenate([run.states, run.inputs], axis=1).T, strict=True))
+        found = dict(zip(names, np.concatenate([run.states, run.rows], axis=1).T, strict=True))
         seen = zip(form.features, form.features_at(run.states, run.rows).T, strict=False)
         return found | {str(entry): row for entry, row in seen if str(entry) not in found}
 

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.mapped_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
-from orthaug.inference.motion_split import learned_places, shared_of_motion, slopes_at
+from orthaug.inference.splitting import learned_places, shared_of_motion, slopes_at
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
@@ -384,6 +384,6 @@ def _least_left(target: Vector, columns: Matrix, others: Matrix, most: int) -> f
 
 def _choices(motion: Motion) -> Iterator[tuple[str, ...]]:
     """Yield each state alone, all states, all states and inputs."""
-    states = motion.names_of_states
+    states = motion.visible_states
     yield from ((name,) for name in states)
-    yield from (several for several in (states, (*states, *motion.inputs)) if len(several) > 1)
+    yield from (several for several in (states, motion.visible) if len(several) > 1)

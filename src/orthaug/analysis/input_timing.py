@@ -17,7 +17,7 @@ from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner, nothing_learned
 from orthaug.physics.motion import HOLDS, Motion
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.problem import MotionProblem
 
 ROWS = 4000  # at most
 _CLEARLY = 0.02  # lower, of the residual: another hold
@@ -82,7 +82,7 @@ def try_holds(
     task = on_longest(problem, criterion, solver, structure, learner)
     motion, free_fit = problem.motion, task.physics
     found = [_declared_trial(task.plan, free_fit, declared=True)]
-    several = not motion.scheme.discrete and bool(motion.inputs) and free_fit is not None
+    several = not motion.scheme.discrete and bool(motion.driving) and free_fit is not None
     for hold in HOLDS if several else ():
         if hold != motion.hold:
             found.append(_try_hold(hold, task, solver))
@@ -210,7 +210,7 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
     if task.physics is None:
         return ()
     found, most = [], len(task.problem.record) // _LONGEST
-    for number, name in enumerate(task.problem.motion.inputs):
+    for number, name in enumerate(task.problem.motion.external):
         delays = _Delays(
             task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)}
         )

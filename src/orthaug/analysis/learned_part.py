@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp
-from orthaug.fitting.motion_estimates import MotionEstimate, free_covariance
+from orthaug.fitting.motion_estimate import MotionEstimate, free_covariance
 from orthaug.inference.covariance import reach
-from orthaug.inference.motion_split import rest_of
+from orthaug.inference.splitting import rest_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.models.moving import MotionDynamics

@@ -86,7 +86,7 @@ class LaggedStep:
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
 
-    def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
+    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
         """Return the learner's features at rest.
 
         None where it is unknown which of them training reached.
@@ -126,7 +126,7 @@ class MotionStep:
 
     @property
     def continuous(self) -> bool:
-        return not self.form.motion.scheme.discrete
+        return not (self.form.motion.scheme.discrete or self.form.motion.held)
 
     @property
     def ends(self) -> int:
@@ -142,7 +142,7 @@ class MotionStep:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return self.form.motion.inputs
+        return self.form.motion.external
 
     def state_at(self, rest: Any, inputs: Any) -> Any:
         """Return the state itself."""
@@ -153,7 +153,12 @@ class MotionStep:
         return following, parts.total
 
     def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
-        """Return the derivatives in time, or a discrete motion's next state, and the outputs."""
+        """Return the derivatives in time, or a discrete motion's next state, and the outputs.
+
+        With a controller the motion is known at samples only.
+        """
+        if self.form.motion.held:
+            return self.advance(numbers, state, jnp.concatenate([inputs] * self.ends))
         return sum(self.form.rates(numbers, state, inputs)), self.form.observed(
             numbers, state, inputs
         )
@@ -162,10 +167,11 @@ class MotionStep:
         rates, y = self.field(numbers, rest, inputs)
         return (rates if self.continuous else rates - rest), y
 
-    def seen(self, rest: Vector, inputs: Vector) -> Vector | None:
+    def seen(self, numbers: Numbers, rest: Vector, inputs: Vector) -> Vector | None:
         if not self.form.differentiable:
             return None
-        return np.asarray(self.form.seen(rest[:, None], inputs[:, None], np))[:, 0]
+        read = self.form.at_samples(numbers, rest[None], inputs[None])
+        return self.form.features_at(rest[None], read)[0]
 
 
 Step = LaggedStep | MotionStep

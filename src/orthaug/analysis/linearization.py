@@ -25,7 +25,6 @@ from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 
 _POINTS = 400  # of the frequency grid
@@ -45,7 +44,7 @@ class _Spread(NamedTuple):
 
 
 def linearize(
-    model: Model | Estimate | MotionEstimate,
+    model: Model | Estimate,
     at: str | Mapping[str, float] | None = None,
     record: Record | None = None,
     *,
@@ -77,7 +76,7 @@ def linearize(
         >>> round(linearize(oa.estimate(record, physics, learner=None))[0].poles[0].z.real, 6)
         0.5
     """
-    kinds = Model | Estimate | MotionEstimate
+    kinds = Model | Estimate
     check_type(model, kinds, "model", "a fitted model, or what estimate returns")
     check_type(record, Record | None, "record", "a Record, or None")
     check_choice(continuous, METHODS, "`continuous`")

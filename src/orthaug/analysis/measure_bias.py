@@ -21,7 +21,7 @@ from orthaug.analysis.mapped_bias import physical_of, physical_slopes
 from orthaug.analysis.suspects import Suspect
 from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.inference.linearization import Linearization
 from orthaug.inference.measures import (
     Measure,
@@ -63,7 +63,7 @@ class LaggedTerms:
     map: PhysicsMap | None = None
     learned: Matrix | None = None
     directions: Matrix | None = None
-    fit: Estimate | None = None
+    fit: LaggedEstimate | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,7 +244,7 @@ def bias_under(
 
 
 def linearization_of(
-    fit: Estimate, measure: Measure, physics: PhysicsMap | None = None
+    fit: LaggedEstimate, measure: Measure, physics: PhysicsMap | None = None
 ) -> LaggedTerms:
     """Return a fit for biases by terms, under the measure that θ was split under."""
     weighed = weigh_problem(measure, fit.problem)

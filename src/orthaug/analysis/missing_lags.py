@@ -20,7 +20,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Smoother
 from orthaug.analysis.residuals import errors_of
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.inference.covariance import newey_west
 from orthaug.models.response import Response
 from orthaug.physics.output_weights import times
@@ -86,7 +86,7 @@ class MissingLags:
         return (Warning("missing_lag", self.text),) if self.missing else ()
 
 
-def missing_lags(fit: Estimate, one_step: Response | None = None) -> MissingLags | None:
+def missing_lags(fit: LaggedEstimate, one_step: Response | None = None) -> MissingLags | None:
     """Return the tests of a one-step fit.
 
     None where the learner sees all lags, without a learner, with a noise model, or with too few

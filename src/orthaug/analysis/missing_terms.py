@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, padded_length
 from orthaug.analysis.suspects import changes_sign
-from orthaug.fitting.motion_estimates import MotionEstimate, fitted_numbers
+from orthaug.fitting.motion_estimate import MotionEstimate, fitted_numbers
 from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
@@ -91,7 +91,9 @@ def sensitivities(
     most = max(min(_ROWS, _NUMBERS // (target.shape[2] * (n0 + n + q))) // steps, 1)
     taken = there[np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).astype(int))]
     x, u, target, scored = (part[taken, :steps] for part in (x, u, target, scored))
-    rows = np.concatenate([x, form.now(u)], axis=2)
+    at = x.shape[0] * x.shape[1]
+    read = form.at_samples(numbers, *(part.reshape(at, part.shape[2]) for part in (x, u)))
+    rows = np.concatenate([x, read.reshape(*x.shape[:2], read.shape[1])], axis=2)
     points = rows[scored].T
     if not np.isfinite(points).all():
         return None
@@ -247,16 +249,17 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     motion = fit.problem.motion
     if not fit.segmented.dynamics.differentiable:
         return None
-    names = (*motion.names_of_states, *motion.inputs)
+    names = motion.visible
+    own = [(*motion.names_of_states, *motion.inputs).index(name) for name in names]
     equations = doubted_equations(fit)
     count = 1 + len(SHAPES) * len(names)
     found_of: list[tuple[Vector, list[bool]]] = []
 
     def terms(points: Matrix) -> Terms:
-        size = np.abs(points).max(axis=1, initial=0.0)
+        size = np.abs(points[own]).max(axis=1, initial=0.0)
         size = np.where(size > 0, size, 1.0)
-        found_of.append((size, [not changes_sign(values) for values in points]))
-        return lambda rows: _values(rows / size[:, None], found_of[0][1])
+        found_of.append((size, [not changes_sign(values) for values in points[own]]))
+        return lambda rows: _values(rows[own] / size[:, None], found_of[0][1])
 
     found = sensitivities(fit, equations, terms, count)
     if found is None:

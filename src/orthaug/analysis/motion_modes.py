@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
-from orthaug._base.jax import Array, jax
+from orthaug._base.jax import Array, jax, jnp
 from orthaug._base.lines import percent
 from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
 from orthaug.analysis.boundedness import divergence_scaling, margin
@@ -109,7 +109,10 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
         f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
         f"{found.median:.4g} 1/s."
     )
-    warnings = (Warning("growing_mode", text),) if found.growing > _OFTEN else ()
+    often = found.growing > _OFTEN
+    if often and not model.form.motion.held:
+        text += " If a controller held the plant, give `controller` and the reference as input."
+    warnings = (Warning("growing_mode", text),) if often else ()
     return MotionStability(found, warnings, text)
 
 
@@ -162,7 +165,7 @@ def modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> Modes | None:
     if not kept.any():
         return None
     values = np.linalg.eigvals(slopes[kept])
-    if model.form.motion.scheme.discrete:
+    if model.form.motion.scheme.discrete or model.form.motion.held:
         small = np.abs(values) < 1e-300  # gone in one sample
         values = np.log(np.where(small, 1e-300, values).astype(complex)) / model.sampling_time
     size = np.abs(values)
@@ -179,7 +182,7 @@ def modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> Modes | None:
         growing=float((largest > 0).mean()),
         slowest=float(np.abs(others).min(initial=fastest)),
         fastest=fastest,
-        worst=model.form.describe(x[place], u[place]),
+        worst=model.form.describe(x[place], model.form.external(u[place])),
         integrators=integrators,
     )
 
@@ -189,6 +192,9 @@ def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nx nx"]:
     def rate(x: Any, u: Any) -> Any:
+        if form.motion.held:  # of a loop: the step from a sample to the next
+            ends = 2 if form.motion.hold == "first-order" else 1
+            return form.step(numbers, x, jnp.concatenate([form.external(u)] * ends))[0]
         return sum(form.rates(numbers, x, u))
 
     return jax.vmap(jax.jacfwd(rate))(x, u)

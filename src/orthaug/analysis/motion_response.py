@@ -30,7 +30,7 @@ from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segments import Segments, respond, sensitivity
 from orthaug.models.dynamics import Numbers
@@ -213,7 +213,9 @@ def _signals(place: FreeRunPoint, added: Sequence[SuspectedTerm]) -> list[Matrix
     segmented, motion = place.segmented, place.segmented.problem.motion
     p, step = motion.coordinates.physical(place.c), segmented.record.sampling_time
     states = segmented.states_by_row(place.c, place.w, place.states)
-    inputs = [np.asarray(experiment.inputs) for experiment in segmented.record.experiments]
+    form, numbers = segmented.dynamics, segmented.numbers(place.c, place.w)
+    rows = [form.inputs(one, segmented.record) for one in segmented.record.experiments]
+    inputs = [form.at_samples(numbers, x, row) for x, row in zip(states, rows, strict=True)]
     return [
         np.stack([signal.along(motion, p, x, u, step) for signal in signals], axis=1)
         for x, u in zip(states, inputs, strict=True)

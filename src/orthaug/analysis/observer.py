@@ -13,7 +13,6 @@ from orthaug.analysis.observed import Observations, ObserverRun
 from orthaug.analysis.observer_noise import by_verdict, most_likely, of_fit
 from orthaug.data.record import Experiment, Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.dynamics import Parts
 from orthaug.models.kalman import (
     FilterRow,
@@ -52,12 +51,12 @@ class Observer:
     def __post_init__(self) -> None:
         check_type(
             self.model,
-            Model | Estimate | MotionEstimate,
+            Model | Estimate,
             "model",
             "a fitted model or a fit",
         )
         given, noise = self.model, self.noise
-        fit = given if isinstance(given, Estimate | MotionEstimate) else None
+        fit = given if isinstance(given, Estimate) else None
         model: Any = given if fit is None else fit.model
         if not model.form.differentiable:
             raise InputError(

@@ -18,7 +18,6 @@ from orthaug._base.errors import InputError
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.kalman import Noise, log_likelihood
 from orthaug.models.model import Model
 
@@ -78,7 +77,7 @@ def with_share(model: Model, noise: Matrix, share: float) -> Noise:
     return Noise(factor * unit, (1 - share) * np.array(noise))
 
 
-def of_fit(fit: Estimate | MotionEstimate) -> Noise:
+def of_fit(fit: Estimate) -> Noise:
     """Return the noises of a fit by the verdict on its residual.
 
     Where both are there, by the likelihood of its data.
@@ -96,7 +95,7 @@ def of_fit(fit: Estimate | MotionEstimate) -> Noise:
     return begun
 
 
-def to_keep(fit: Estimate | MotionEstimate, verdict: str) -> Noise | None:
+def to_keep(fit: Estimate, verdict: str) -> Noise | None:
     """Return the noises that a fit keeps with its model, by likelihood, if both kinds are present.
 
     None where the verdict's rule is as good, without an estimate of the noise, and where a filter

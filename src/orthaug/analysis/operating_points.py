@@ -296,7 +296,7 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     _, slope, y = search.equations(point)
     outputs = dict(zip(step.form.outputs, map(float, y), strict=True))
     values = dict(zip((*step.rest, *step.inputs), map(float, point), strict=True))
-    seen = step.seen(rest, inputs)
+    seen = step.seen(search.numbers, rest, inputs)
     beyond = seen is not None and bool(search.beyond(seen[None])[0])
     outside = beyond or bool(np.any(np.abs(rest) > search.size))
     free = search.free

@@ -32,7 +32,7 @@ class LinearRun:
     inputs: Matrix
     """The experiment's inputs (T, nu) at the same rows."""
     rows: Matrix
-    """What the steps read, (T, nr)."""
+    """What the learner's features read beside the states, (T, nr)."""
     error: Matrix
     to_state: Float[np.ndarray, "T n0 n0"]
     to_output: Float[np.ndarray, "T ny n0"]
@@ -109,7 +109,8 @@ def _linearize(
     ):
         return None
     a, c, b, d = (np.where(np.isfinite(part), part, 0.0) for part in (a, c, b, d))
-    return LinearRun(states, inputs, rows, outputs - run, a, c, b, d)
+    read = form.at_samples(numbers, states, rows)
+    return LinearRun(states, inputs, read, outputs - run, a, c, b, d)
 
 
 @partial(jax.jit, static_argnames="form")

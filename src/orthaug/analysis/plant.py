@@ -218,11 +218,11 @@ class MotionPlant:
         substeps: int,
         channel: str | None = None,
     ) -> None:
-        self.channel = choose_channel(channel, motion.inputs)
+        self.channel = choose_channel(channel, motion.external)
         check_guesses(suspects)
         self.names, self.theta, self.motion = motion.names, np.asarray(p, dtype=float), motion
         self.outputs: Sequence[str] = tuple(output.name for output in motion.outputs)
-        self.others = {name: np.zeros((1, 1)) for name in motion.inputs if name != self.channel}
+        self.others = {name: np.zeros((1, 1)) for name in motion.external if name != self.channel}
         starts = [state.start for state in motion.states]
         self.before = np.array(
             [start if isinstance(start, float | int) else 0.0 for start in starts], dtype=float
@@ -262,7 +262,7 @@ class MotionPlant:
             for name, v in self.others.items()
         }
         together = np.stack(
-            [{self.channel: padded, **signals}[name] for name in motion.inputs], axis=1
+            [{self.channel: padded, **signals}[name] for name in motion.external], axis=1
         )
         read = np.stack(
             [

@@ -28,7 +28,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse, parse_named
 from orthaug.data.regressors import Layout
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.problem import MotionProblem
 from orthaug.physics.suspected_motion import (
     Signal,
     SuspectedTerm,

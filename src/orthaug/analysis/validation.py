@@ -25,7 +25,6 @@ from orthaug.fitting.held_out import (
     mean_square,
     squared_errors,
 )
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 
@@ -333,8 +332,8 @@ def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | Non
 
 
 def verdict(
-    fit: Estimate | MotionEstimate,
-    alone: Estimate | MotionEstimate,
+    fit: Estimate,
+    alone: Estimate,
     tests: Record | Mapping[str, Record],
     *,
     skip: int = 0,
@@ -368,7 +367,7 @@ def verdict(
         'helps'
     """
     for name, estimate in (("fit", fit), ("alone", alone)):
-        check_type(estimate, Estimate | MotionEstimate, name, "an Estimate")
+        check_type(estimate, Estimate, name, "an Estimate")
         if not estimate.status.ok:
             raise InputError(f"`{name}` has no model: {estimate.status.message}.")
     check_type(tests, Record | Mapping, "tests", "a Record, or Records by name")

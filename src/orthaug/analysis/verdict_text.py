@@ -14,8 +14,8 @@ from orthaug.analysis.input_timing import DeadTime
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import ResidualTest
-from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
@@ -85,7 +85,7 @@ class Diagnosis:
 class Finding:
     """Findings on a fit's residuals. `ratio` and `noise` are those of `Diagnosis`."""
 
-    fit: Estimate
+    fit: LaggedEstimate
     simulated: bool
     one_step: Response
     tests: tuple[ResidualTest, ...]
@@ -387,6 +387,11 @@ def _colour_warning(what: str) -> Warning:
     return Warning("coloured_residual", text)
 
 
+_BY_INNOVATIONS = (
+    ' Of disturbances, `noise.model` = "innovations" estimates the parameters with right intervals.'
+)
+
+
 def free_run_words(
     verdict: str,
     fit: MotionEstimate,
@@ -400,32 +405,39 @@ def free_run_words(
     """Return the verdict on a motion's free run in words, with its reason."""
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
+    modelled = fit.model.coloured
+    subject = "The error one step ahead" if modelled else "The free run's error"
+    if verdict == "white" and modelled:
+        noise = "is white: the gain of the predictor accounts for process noise and sensor noise."
+        return f"{subject} ({sizes}) {noise}{small_effects(tests, shares)}"
     if verdict == "white":
         noise = "is white: noise on the outputs, which the training assumes."
-        return f"The free run's error ({sizes}) {noise}{small_effects(tests, shares)}"
+        return f"{subject} ({sizes}) {noise}{small_effects(tests, shares)}"
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
         no_input = "no input, " if fit.problem.motion.inputs else ""
         colour = describe_colour(tests, shares)
+        remedy = "" if modelled or fit.problem.motion.held else _BY_INNOVATIONS
+        fed = "sensor noise that the controller feeds back, " if fit.problem.motion.held else ""
         return (
-            f"The free run's error ({sizes}) is coloured ({colour}). It follows {no_input}no state "
-            "at the same instant, and no simple missing term. Its cause is "
-            f"disturbances, or physics missing in an equation {learner}."
+            f"{subject} ({sizes}) is coloured ({colour}). It follows {no_input}no state "
+            f"at the same instant, and no simple missing term. Its cause is {fed}"
+            f"disturbances, or physics missing in an equation {learner}.{remedy}"
         )
     if late:
         return (
-            f"The free run's error ({sizes}) contains more than noise. Most likely "
+            f"{subject} ({sizes}) contains more than noise. Most likely "
             f"{late[0].input} acts later than in the equations: {late[0].gain}."
         )
     if lacks is not None:
-        return f"The free run's error ({sizes}) contains more than noise. {_name_terms(lacks)}"
+        return f"{subject} ({sizes}) contains more than noise. {_name_terms(lacks)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} varies with {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
     held = "Physics is missing" + (
         ", or inputs move differently between samples" if fit.problem.motion.inputs else ""
     )
-    return f"The free run's error ({sizes}) contains more than noise: {'; '.join(what)}. {held}."
+    return f"{subject} ({sizes}) contains more than noise: {'; '.join(what)}. {held}."
 
 
 def small_effects(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:
@@ -479,7 +491,8 @@ def _name_terms(lacks: MissingTest) -> str:
 
 def colour_sentence(fit: MotionEstimate) -> str:
     """Return a sentence on coloured errors, and on the standard errors that follow."""
-    text = "the errors of the free run are coloured: judge the model by held-out errors"
+    errors = "one step ahead" if fit.model.coloured else "of the free run"
+    text = f"the errors {errors} are coloured: judge the model by held-out errors"
     if fit.std is None or fit.plain_covariance is not None:
         return f"{text}."
     return (

@@ -17,12 +17,13 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug._base.lines import plural
 from orthaug._base.progress import LOG
+from orthaug.analysis.changes import Change
+from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
-from orthaug.reports.findings import AdviceResult, AdviceTrialsResult, ChangeResult
 from orthaug.reports.result import FitResult
 
 _SHAPES = {
@@ -173,7 +174,7 @@ def _has_compared_criteria(result: FitResult) -> bool:
     return result.focus is not None and bool(result.focus.candidates)
 
 
-def _lag_words(change: ChangeResult) -> str:
+def _lag_words(change: Change) -> str:
     return "an offset" if change.kind == "offset" else f"the further lag {change.what}"
 
 
@@ -312,7 +313,10 @@ class Trials:
             InputError: the change is not possible; ValueError likewise.
         """
         return self.job.with_spec(
-            spec_model().model_validate(apply_change(self.job.declaration, change | self.settled))
+            spec_model().model_validate(
+                apply_change(self.job.declaration, change | self.settled),
+                context={"folder": self.job.path.parent},
+            )
         )
 
     def run(

@@ -88,7 +88,8 @@ def training_bar(
         def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
             done[run] = iteration
-            reached = f"run {run + 1} of {runs}, iteration {iteration}, loss {loss:.3g}"
+            count = max(runs, run + 1)  # a run may be made again
+            reached = f"run {run + 1} of {count}, iteration {iteration}, loss {loss:.3g}"
             passes = sum(done.values())
             rate = rows * passes / max(time.monotonic() - began, 1e-3)
             description = (
@@ -130,7 +131,7 @@ class _Lines:
         self._last = time.monotonic()
         fields = {
             "run": run + 1,
-            "runs": self.runs,
+            "runs": max(self.runs, run + 1),
             "iteration": iteration,
             "iterations": self.iterations,
         }

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.commands.parts import expand_files
+from orthaug.inference.chosen_terms import Intervals
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
-from orthaug.selection.parts import CONDITIONAL, Intervals, Parts, of_parts, split_record
+from orthaug.selection.parts import CONDITIONAL, Parts, of_parts, split_record
 
 if TYPE_CHECKING:
     from orthaug.commands.job import Job

@@ -23,12 +23,12 @@ from orthaug.commands.program import (
     AsJson,
     Force,
     ListOptionCommand,
-    OutFolder,
     SpecPath,
     app,
     arguments,
     main,
     other_writes,
+    out_folder,
     prepare_jax,
     print_result,
 )
@@ -38,8 +38,10 @@ __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
 
 
-@app.command()
-def demo(out: OutFolder = None, force: Force = False) -> None:
+@app.command(epilog="Example: orthaug demo --out first")
+def demo(
+    out: Annotated[Path | None, out_folder("orthaug-out/demo")] = None, force: Force = False
+) -> None:
     """Fit the paper's example and compare with the truth."""
     from orthaug.commands.folder import check_folder
 
@@ -54,12 +56,15 @@ def demo(out: OutFolder = None, force: Force = False) -> None:
     streams.echo(f"\nwritten to {folder}")
 
 
-@app.command()
+@app.command(epilog="Example: orthaug check spec.toml")
 def check(
     spec: SpecPath,
     as_json: AsJson = False,
     figure: Annotated[
-        Path | None, typer.Option("--figure", metavar="PNG", help="Heat map of the biases.")
+        Path | None,
+        typer.Option(
+            "--figure", metavar="PNG", help="Heat map of the biases.", show_default="none"
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -74,20 +79,21 @@ def check(
     if job.physics.runs_in_check:
         prepare_jax()
     result = check_job(job)
-    print_result(result, check_text(result), as_json)
+    refused = job.physics.refusal(job, result)
+    failure = None if refused is None else type(refused)(f"{spec}: {refused}")
+    print_result(result, check_text(result), as_json, failure=failure)
     if figure is not None and result.bias:
         from orthaug.reports.finding_plots import bias_figure
 
         save_figure(bias_figure(result.bias), figure, force=force)
-    refused = job.physics.refusal(job, result)
-    if refused is not None:
-        raise type(refused)(f"{spec}: {refused}")
+    if failure is not None:
+        raise failure
 
 
-@app.command()
+@app.command(epilog="Example: orthaug fit spec.toml --out result")
 def fit(
     spec: SpecPath,
-    out: OutFolder = None,
+    out: Annotated[Path | None, out_folder("orthaug-out/SPEC")] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an earlier fit from its last state.")
     ] = False,
@@ -113,22 +119,29 @@ def fit(
     if other_writes():
         return
     write_result(fitted, folder, force=force)
-    print_result(fitted.result, fit_text(fitted.fit, fitted.result), as_json, folder)
+    failure = None
     if not fitted.fit.status.ok:
-        raise TrainingError(
+        failure = TrainingError(
             f"{fitted.result.status.message.removesuffix('.')}. The details are in "
             f"{folder / 'result.json'}."
         )
+    text = fit_text(fitted.fit, fitted.result)
+    print_result(fitted.result, text, as_json, folder, failure)
+    if failure is not None:
+        raise failure
 
 
-@app.command()
+@app.command(epilog="Example: orthaug compare spec.toml --out comparison")
 def compare(
     spec: SpecPath,
-    out: OutFolder = None,
+    out: Annotated[Path | None, out_folder("orthaug-out/SPEC")] = None,
     model: Annotated[
         list[Path] | None,
         typer.Option(
-            "--model", metavar="MODEL", help="A saved model to compare with; may be repeated."
+            "--model",
+            metavar="MODEL",
+            help="A saved model to compare with; may be repeated.",
+            show_default="none",
         ),
     ] = None,
     as_json: AsJson = False,
@@ -158,7 +171,7 @@ def compare(
     )
 
 
-@app.command()
+@app.command(epilog="Example: orthaug design spec.toml --out input.csv")
 def design(
     spec: SpecPath,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file for the input.")],
@@ -185,9 +198,72 @@ def design(
     print_result(result, design_text(result), as_json, out)
 
 
-@app.command()
+@app.command(epilog="Example: orthaug recover spec.toml --draws 40")
+def recover(
+    spec: SpecPath,
+    out: Annotated[Path | None, out_folder("orthaug-out/SPEC-recovery")] = None,
+    draws: Annotated[
+        int, typer.Option("--draws", metavar="N", help="Data sets to simulate and fit.")
+    ] = 20,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of all random numbers.")] = 0,
+    share: Annotated[
+        float | None,
+        typer.Option(
+            "--share",
+            metavar="S",
+            help="Size of the planted term over that of the physics.",
+            show_default="as the learner's",
+        ),
+    ] = None,
+    terms: Annotated[
+        str,
+        typer.Option(
+            "--terms",
+            metavar="declared,usual,memory",
+            help="Groups of planted terms: [[suspects]], the usual ones, one with memory.",
+        ),
+    ] = "declared,usual,memory",
+    choices: Annotated[
+        int | None,
+        typer.Option(
+            "--choices",
+            metavar="N",
+            help="Draws on which other choices are fitted too.",
+            show_default="4",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Rehearse the fit on simulated data with a known truth.
+
+    An interrupted run continues where it stopped.
+    """
+    from orthaug.commands.folder import check_inputs_kept
+    from orthaug.commands.opening import open_job
+    from orthaug.commands.recover import Asked, DrawFolder, rehearse, write
+    from orthaug.reports.recovery import recover_text
+
+    groups = [word.strip() for word in terms.split(",") if word.strip()]
+    asked = Asked(draws, seed, share, groups, choices)
+    folder = out or Path("orthaug-out") / f"{spec.stem}-recovery"
+    job = open_job(spec)
+    check_inputs_kept(job, folder)
+    draw_folder = DrawFolder(folder, force)
+    draw_folder.check(job)
+    prepare_jax()
+    with study_bars() as progress:
+        made = rehearse(job, asked, draw_folder, partial(progress, "rehearsal"))
+    write(made, folder)
+    print_result(made.result, recover_text(made.result), as_json, folder)
+
+
+@app.command(epilog="Example: orthaug select spec.toml --out selected")
 def select(
-    spec: SpecPath, out: OutFolder = None, as_json: AsJson = False, force: Force = False
+    spec: SpecPath,
+    out: Annotated[Path | None, out_folder("orthaug-out/SPEC-selected")] = None,
+    as_json: AsJson = False,
+    force: Force = False,
 ) -> None:
     """Choose orders, delay and terms, and write a spec with them.
 
@@ -206,11 +282,13 @@ def select(
     with selection_bar(steps_at_most(given.selection.terms)) as report_model:
         selected = select_for(job, given, folder, report_model)
     write_selected(selected, folder, force=force)
-    place = f"{folder}; next: orthaug fit {folder / 'spec.toml'}"
+    place = f"{folder}\nnext: orthaug fit {folder / 'spec.toml'}"
     print_result(selected.result, selection_text(selected.result), as_json, place)
 
 
-@app.command(cls=ListOptionCommand)
+@app.command(
+    cls=ListOptionCommand, epilog="Example: orthaug init run.csv --inputs force --outputs position"
+)
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The spec to write.")] = Path(
@@ -218,20 +296,38 @@ def init(
     ),
     inputs: Annotated[
         list[str] | None,
-        typer.Option("--inputs", metavar="A B", help="Columns of the inputs; A,B for several."),
+        typer.Option(
+            "--inputs",
+            metavar="A B",
+            help="Columns of the inputs; A,B for several.",
+            show_default="by their names, or asked for",
+        ),
     ] = None,
     outputs: Annotated[
-        list[str] | None, typer.Option("--outputs", metavar="Y", help="Columns of the outputs.")
+        list[str] | None,
+        typer.Option(
+            "--outputs",
+            metavar="Y",
+            help="Columns of the outputs.",
+            show_default="by their names, or asked for",
+        ),
     ] = None,
     sampling_time: Annotated[
-        float | None, typer.Option("--sampling-time", metavar="S", help="Between rows.")
+        float | None,
+        typer.Option(
+            "--sampling-time",
+            metavar="S",
+            help="Between rows.",
+            show_default="by the column of the time",
+        ),
     ] = None,
     system: Annotated[
         str | None,
         typer.Option(
             "--system",
             metavar="KIND[,KEY=VALUE]",
-            help="Physics instead of linear lags: hammerstein_wiener,order=3.",
+            help="Physics of the spec, such as hammerstein_wiener,order=3.",
+            show_default="linear lags",
         ),
     ] = None,
     force: Force = False,
@@ -281,7 +377,7 @@ def init(
     spec = draft(found, roles, out, declared)
     report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
-    streams.echo(f"{spec.account}\n\nwritten to {out}; next: orthaug fit {out}")
+    streams.echo(f"{spec.account}\n\nwritten to {out}\nnext: orthaug fit {out}")
 
 
 def _silent(line: str) -> None:
@@ -305,14 +401,17 @@ def _ask(text: str, check: Callable[[str], Any], default: str | None = "") -> st
             return answer
 
 
-@app.command("app")
+@app.command("app", epilog="Example: orthaug app spec.toml")
 def page(
     spec: Annotated[
-        Path | None, typer.Argument(metavar="[SPEC]", help="Spec to start with; it is not changed.")
+        Path | None,
+        typer.Argument(
+            metavar="[SPEC]", help="Spec to start with; it is not changed.", show_default="none"
+        ),
     ] = None,
     port: Annotated[
         int | None,
-        typer.Option("--port", metavar="N", help="Port to listen on; a free one by default."),
+        typer.Option("--port", metavar="N", help="Port to listen on.", show_default="a free one"),
     ] = None,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open it in the browser.")
@@ -327,14 +426,14 @@ def page(
     serve(spec, port=port, browser=browser)
 
 
-@app.command()
+@app.command(epilog="Example: orthaug schema keys")
 def schema(
     command: Annotated[
         str,
         typer.Argument(
             metavar="[WHAT]",
-            help="fit, check, compare, split, design, select, explain, linearize or track: what "
-            "the command writes; spec: a spec file; keys: every key of a spec, in words.",
+            help="A command with --json: what it writes; error: what it prints where it fails; "
+            "spec: a spec file; keys: every key of a spec, in words.",
         ),
     ] = "fit",
 ) -> None:
@@ -348,12 +447,12 @@ def schema(
         streams.echo(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))
 
 
-@app.command()
+@app.command(epilog="Example: orthaug reproduce --small")
 def reproduce(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="One study; all by default.")
+        str | None, typer.Argument(metavar="[NAME]", help="One study.", show_default="all")
     ] = None,
-    out: OutFolder = None,
+    out: Annotated[Path | None, out_folder("orthaug-out/reproduction")] = None,
     pipeline: Annotated[
         str,
         typer.Option(
@@ -368,7 +467,10 @@ def reproduce(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler", metavar="ADDRESS", help="Dask cluster whose workers do the runs."
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Dask cluster whose workers do the runs.",
+            show_default="none",
         ),
     ] = None,
     force: Force = False,
@@ -396,6 +498,69 @@ def reproduce(
     with WATCH.report_stop(lambda: "the writing of the page", then=GO_ON):
         reproduction.write(reproduced, folder, pipeline, force=force)
     streams.echo(f"{reproduction.text(reproduced)}\n\nwritten to {folder}/index.html")
+
+
+@app.command(epilog="Example: orthaug benchmark silverbox --data sets")
+def benchmark(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="Sets to measure.", show_default="all"),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            metavar="DIR",
+            help="Folder of the sets' files.",
+            show_default="the variable ORTHAUG_DATA",
+        ),
+    ] = None,
+    out: Annotated[Path | None, out_folder("orthaug-out/benchmark")] = None,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--beside",
+            metavar="PACKAGE",
+            help="Another package on the same rows: sysidentpy or jax-sysid; none for no other.",
+            show_default="all",
+        ),
+    ] = None,
+    defaults: Annotated[
+        bool,
+        typer.Option(
+            "--defaults",
+            help="Fit the first model also with nothing chosen beyond its physics, which may "
+            "take longer than all the rest.",
+        ),
+    ] = False,
+    listed: Annotated[
+        bool, typer.Option("--list", help="Print the sets and their protocols; measure nothing.")
+    ] = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Measure public data sets beside the published figures.
+
+    The data are not part of the package: `--list` prints the source of every set.
+    """
+    from orthaug.reports.benchmark import benchmark_text, list_text
+    from orthaug.studies.other_packages import choose_packages
+    from orthaug.studies.public_sets import choose_sets
+
+    sets = choose_sets(names or [])
+    packages = choose_packages(beside or [])
+    if listed:
+        streams.echo(list_text([one.result() for one in sets]))
+        return
+    from orthaug.commands import benchmark as records
+
+    place, folder = records.data_folder(data), out or Path("orthaug-out/benchmark")
+    records.check_output(folder, place, force=force)
+    prepare_jax()
+    result = records.benchmark(sets, place, packages, training_bar, streams.say, defaults=defaults)
+    with WATCH.report_stop(lambda: "the writing of the folder"):
+        records.write(result, folder, place, force=force)
+    print_result(result, benchmark_text(result), as_json, folder)
 
 
 from orthaug.commands import model_cli  # noqa: E402, F401  (its commands come after these)

@@ -12,23 +12,19 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug._base.progress import SILENT, Progress
+from orthaug.analysis.doubts import doubt
+from orthaug.analysis.examination import cross_validated, judge_fit
+from orthaug.analysis.fit_findings import parameter_rows
+from orthaug.analysis.scoring import score_part
 from orthaug.analysis.validation import Verdict, dominance
-from orthaug.commands.doubts import with_doubts
-from orthaug.commands.fit import (
-    FitReport,
-    cross_validated,
-    fit_variant,
-    judge_fit,
-    score_part,
-    wanted_blocks,
-)
+from orthaug.commands.fit import FitReport, fit_variant
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.reports import plots
-from orthaug.reports.result import CompareResult, RowResult, parameter_rows
+from orthaug.reports.result import CompareResult, RowResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +68,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         if decided is not None and kind == job.spec.structure.kind and decided.fit.learns:
             fitted[kind] = decided
             continue
-        fitted[kind] = with_doubts(
-            fit_variant(job, variant, progress.after(runs=number * job.run_count))
-        )
+        fitted[kind] = doubt(fit_variant(job, variant, progress.after(runs=number * job.run_count)))
     verdicts = _verdicts(job, fitted)
     rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
     rows += [_saved_row(name, model, job) for name, model in models.items()]
@@ -95,7 +89,7 @@ def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | Non
     if not declared.automatic:
         return declared, None
     kind = job.spec.structure.kind if job.spec.structure.kind in job.compared else PHYSICS_ONLY
-    fitted = with_doubts(fit_variant(job, Variant(kind), progress))
+    fitted = doubt(fit_variant(job, Variant(kind), progress))
     return (fitted.fit.criterion if fitted.fit.status.ok else Prediction()), fitted
 
 
@@ -106,13 +100,11 @@ def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
     if not kinds or not alone.status.ok:
         return {}
     criterion = alone.criterion
-    blocks, simulates = wanted_blocks(job), criterion.simulates
+    blocks, simulates = job.evidence.wanted_blocks, criterion.simulates
     if simulates or not blocks:  # free runs were chosen by the same trials
         trials = [None] * len(kinds)
     else:
-        trials = cross_validated(
-            job, blocks, [Variant(kind, criterion=criterion) for kind in kinds]
-        )
+        trials = cross_validated(job.evidence, blocks, [fitted[kind].fit for kind in kinds])
     ran = fitted[PHYSICS_ONLY].responses
     verdicts = {
         k: judge_fit(fitted[k], lambda: alone, own, ran)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -30,6 +31,8 @@ from orthaug.models.learners import Learner
 from orthaug.models.terms import over_states
 from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion, Output, State
+from orthaug.physics.source_kinds import SOURCES
+from orthaug.physics.sources import PhysicsSource
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine
@@ -194,6 +197,17 @@ class OutputSection(Section):
     learned: bool = False
 
 
+class SourceSection(KindSection):
+    """Physics from a file or a package: `[physics.source]`."""
+
+    registries = {"kind": SOURCES}
+    kind: str
+
+    def declared_source(self) -> PhysicsSource:
+        """Return the source as declared."""
+        return self.declared(SOURCES, self.kind)
+
+
 class MotionSection(KindSection):
     """Equations of motion: states, outputs, parameters, and how they are integrated."""
 
@@ -203,15 +217,22 @@ class MotionSection(KindSection):
     integrator: str = "rk4"
     substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"
     hold: Literal[HOLDS] = "zero-order"  # type: ignore[valid-type]
-    states: Annotated[dict[str, StateSection], Field(min_length=1)]
-    outputs: Annotated[dict[str, Text | OutputSection], Field(min_length=1)]
-    parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
+    states: Annotated[dict[str, StateSection], Field(min_length=1)] = {}
+    outputs: Annotated[dict[str, Text | OutputSection], Field(min_length=1)] = {}
+    parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)] = {}
     define: dict[str, Text] = {}
     constants: dict[str, Finite] = {}
+    source: SourceSection | None = None
 
     @model_validator(mode="after")
     def _check_equations(self) -> MotionSection:
         """Check that each state has the equation that its integrator reads."""
+        for name in ("states", "outputs", "parameters", "define", "constants"):
+            if self.source is not None and name in self.model_fields_set:
+                raise ValueError(
+                    f"`{name}`: found beside [physics.source]; expected none, because the source "
+                    "has its own"
+                )
         discrete = self.discrete
         own, other = ("next", "derivative") if discrete else ("derivative", "next")
         kind = "a discrete motion" if discrete else f'`integrator = "{self.integrator}"`'
@@ -230,6 +251,8 @@ class MotionSection(KindSection):
     @property
     def learns(self) -> bool:
         """True if a learner is added to any equation or output."""
+        if self.source is not None:
+            return self.source.declared_source().learns
         outputs = (
             output.learned for output in self.outputs.values() if not isinstance(output, str)
         )
@@ -237,7 +260,7 @@ class MotionSection(KindSection):
 
     def over(self, learner: Any, spec: Any) -> Learner:
         """Return a learner of terms over the states and inputs of a spec."""
-        return over_states(learner, self.motion_of(spec.data.inputs, spec.data.outputs))
+        return over_states(learner, spec.declared_motion())
 
     def criterion(self, training: Any) -> Criterion:
         """Return the criterion of a spec.
@@ -248,13 +271,26 @@ class MotionSection(KindSection):
         washout = {} if "washout" in training.model_fields_set else {"washout": 0}
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
-    def motion_of(self, inputs: Sequence[str], outputs: Sequence[str]) -> Motion:
+    def motion_of(self, inputs: Sequence[str], outputs: Sequence[str], folder: Path) -> Motion:
         """Return the motion, with its channels in the order of the data.
+
+        Args:
+            inputs, outputs: names of the channels.
+            folder: of the spec, from which it names the file of a source.
 
         Raises:
             InputError: names and expressions that cannot be, and what else `Motion.from_equations`
                 refuses.
         """
+        substeps = None if self.substeps == "auto" else self.substeps
+        if self.source is not None:
+            source = replace(
+                self.source.declared_source().in_folder(folder),
+                integrator=self.integrator,
+                substeps=substeps,
+                hold=self.hold,
+            )
+            return source.build(inputs, outputs)
         given = {
             name: OutputSection(expression=o) if isinstance(o, str) else o
             for name, o in self.outputs.items()
@@ -275,6 +311,6 @@ class MotionSection(KindSection):
             constants=self.constants,
             define=self.define,
             integrator=self.integrator,
-            substeps=None if self.substeps == "auto" else self.substeps,
+            substeps=substeps,
             hold=self.hold,
         )

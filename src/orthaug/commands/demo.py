@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.folders import whole_folder
-from orthaug._base.lines import fold
+from orthaug._base.lines import estimate_cells, fold, table
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import FitReport, fill_result, fit_job
 from orthaug.commands.opening import open_job
-from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive
 from orthaug.studies.synthetic import Example, mass_spring_damper
@@ -88,7 +88,7 @@ def run(folder: Path, progress: Progress = SILENT, *, force: bool = False) -> st
     return _comparison(example, orthogonal, additive)
 
 
-def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
+def _additive(example: Example, seed: int, progress: Progress) -> LaggedEstimate:
     return estimate(
         example.train,
         example.baseline,
@@ -99,37 +99,32 @@ def _additive(example: Example, seed: int, progress: Progress) -> Estimate:
     )
 
 
-def _comparison(example: Example, orthogonal: FitReport, additive: list[Estimate]) -> str:
+def _comparison(example: Example, orthogonal: FitReport, additive: list[LaggedEstimate]) -> str:
     fit = orthogonal.fit
-    std = fit.std if fit.std is not None else np.zeros_like(fit.theta)
     thetas = np.array([a.theta for a in additive])
+    rows = [["", "true", "initial", "orthogonal ± std", "additive, range"]]
+    for i, parameter in enumerate(fit.problem.baseline.parameters):
+        value, std, _, _ = estimate_cells(fit.theta[i], None if fit.std is None else fit.std[i])
+        spread = f"{thetas[:, i].min():.4g} … {thetas[:, i].max():.4g}"
+        true = f"{example.theta[i]:.6g}"
+        rows.append([parameter.name, true, f"{parameter.initial:.4g}", f"{value} ± {std}", spread])
+    errors = [np.linalg.norm((t - example.theta) / example.theta) for t in thetas]
+    error = np.linalg.norm((fit.theta - example.theta) / example.theta)
+    spread = f"{min(errors):.4g} … {max(errors):.4g}"
+    rows.append(["relative error of θ", "", "", f"{error:.4g}", spread])
+    for label, verb in (
+        ("one step, RMSE [m]", "predict"),
+        ("free run, RMSE [m]", "simulate"),
+    ):
+        ours = getattr(fit.model, verb)(example.test).scores().rmse[0]
+        theirs = [getattr(a.model, verb)(example.test).scores().rmse[0] for a in additive]
+        rows.append([label, "", "", f"{ours:.3g}", f"{min(theirs):.3g} … {max(theirs):.3g}"])
     lines = [
         "The paper's mass-spring-damper: linear physics, friction left to a network of 16 neurons.",
         f"{RESTARTS} initialisations; the same data, the same network, the same training.",
         "",
-        f"{'':<24}{'true':>12}{'initial':>10}{'orthogonal ± std':>23}   "
-        f"{'additive, lowest … highest':>26}",
+        *table(rows, drop=["initial"]),
     ]
-    for i, parameter in enumerate(fit.problem.baseline.parameters):
-        spread = f"{thetas[:, i].min():.5g} … {thetas[:, i].max():.5g}"
-        value = f"{fit.theta[i]:.6g} ± {std[i]:.2g}"
-        lines.append(
-            f"{parameter.name:<24}{example.theta[i]:>12.6g}{parameter.initial:>10.4g}{value:>23}   "
-            f"{spread:>26}"
-        )
-    errors = [np.linalg.norm((t - example.theta) / example.theta) for t in thetas]
-    error = np.linalg.norm((fit.theta - example.theta) / example.theta)
-    lines.append(
-        f"{'relative error of θ':<46}{error:>23.4g}   "
-        f"{f'{min(errors):.4g} … {max(errors):.4g}':>26}"
-    )
-    for label, verb in (
-        ("test RMSE, one step [m]", "predict"),
-        ("test RMSE, free run [m]", "simulate"),
-    ):
-        ours = getattr(fit.model, verb)(example.test).scores().rmse[0]
-        theirs = [getattr(a.model, verb)(example.test).scores().rmse[0] for a in additive]
-        lines.append(f"{label:<46}{ours:>23.3g}   {f'{min(theirs):.3g} … {max(theirs):.3g}':>26}")
     lines += [
         "",
         "Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = "

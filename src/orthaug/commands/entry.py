@@ -30,8 +30,9 @@ def main() -> None:
     _settle()
     complaint = _complaint()
     if complaint is not None:
-        streams.say(f"error: {complaint}")
-        sys.exit(2)
+        from orthaug.commands.program import fail
+
+        fail("error", complaint, 2, "environment")
     from orthaug.commands import cli
 
     try:

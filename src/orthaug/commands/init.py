@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,13 @@ from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
 from orthaug.physics.motion import Motion
 from orthaug.physics.systems import System
-from orthaug.selection.first_orders import LOOKED_AT, FirstModel, first_model
+from orthaug.selection.first_orders import (
+    FITTED,
+    LOOKED_AT,
+    FirstModel,
+    first_model,
+    free_run_errors,
+)
 
 FILLED = 3
 """Rows of a gap that the spec's step `fill` reconstructs at most."""
@@ -418,7 +425,7 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
     rows, missing = _extent(roles)
     cut = round(TRAINED * rows)
     cut = cut if rows - cut >= _TESTED else rows
-    record, lost = _record(found, roles, cut, missing)
+    record, lost = _record(found, roles, (0, cut), missing)
     model = first_model(record)
     if model is None:
         raise InputError(
@@ -433,6 +440,11 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
     )
     gaps = gap_text(missing) if missing else wild if lost else ""
     motion = None if system is None else system.motion(record)
+    errors = None
+    if cut < rows:
+        with suppress(InputError):  # the last rows may lack samples, and then have no score
+            test, _ = _record(found, roles, (cut, rows), missing)
+            errors = free_run_errors(record, test, model)
     text = spec_text(found, roles, out, rows, cut, gaps, named, model, motion)
     return Draft(
         text,
@@ -443,6 +455,7 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
             missing,
             cut,
             model,
+            errors,
             wild if lost and not missing else "",
             [w.text for w in data_warnings(record)],
         ),
@@ -477,14 +490,14 @@ def _extent(roles: Roles) -> tuple[int, int]:
     return rows, int((~there).sum())
 
 
-def _record(found: Survey, roles: Roles, cut: int, missing: int) -> tuple[Record, int]:
-    """Return the training rows, and how many are left out because a sample is missing."""
+def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) -> tuple[Record, int]:
+    """Return a range of rows, and how many are left out because a sample is missing."""
     inputs, outputs = (
         [Channel(c.name, c.unit, c.header) for c in group]
         for group in (roles.inputs, roles.outputs)
     )
     options: dict[str, Any] = {
-        "rows": (0, cut),
+        "rows": rows,
         "missing": "skip" if missing or not found.clock.even else "error",
     }
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
@@ -506,6 +519,7 @@ def _account(
     missing: int,
     cut: int,
     model: FirstModel,
+    errors: Sequence[float] | None,
     wild: str,
     notes: Sequence[str] = (),
 ) -> str:
@@ -544,13 +558,18 @@ def _account(
                 f"the spec takes {name} from lag {late} on, which runs clearly better on rows "
                 "held out"
             )
-    size, errors = model.orders, ", ".join(percent(error, 3) for error in model.free_run)
     horizon = "one step ahead" if not roles.inputs else "in free run"
+    physics = f"linear, {model.orders}{', with a constant' if model.offset else ''}"
+    if errors is None:
+        errors = model.free_run
+        where = f"the last {percent(1 - FITTED)} of rows 0 to {cut}, fitted to those before"
+    else:
+        where = f"rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
+    shown = ", ".join(percent(error, 3) for error in errors)
     lines.append(
-        f"first physics: linear, {size}{', with a constant' if model.offset else ''}; {horizon} "
-        "its error"
+        f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
+        f"deviation on {where}"
     )
-    lines[-1] += f" on rows held out is {errors} of the output's standard deviation"
     if cut - missing > LOOKED_AT:
         lines.append(
             f"delays and orders are estimated from {LOOKED_AT} of these rows, in windows "

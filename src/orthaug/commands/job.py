@@ -17,14 +17,15 @@ from orthaug import __version__
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
-from orthaug.commands.parts import Part
+from orthaug.analysis.evidence import DEFAULT_BLOCKS, Evidence, sample_warnings
+from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec, load_spec
 from orthaug.data.record import Record
 from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
-    from orthaug.analysis.imitation import Imitation
+    from orthaug.analysis.findings import SuspectResult
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
     from orthaug.fitting.structures import Structure
@@ -33,11 +34,10 @@ if TYPE_CHECKING:
     from orthaug.models.rows import Engine
     from orthaug.physics.parameters import PhysicsMap
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.findings import SuspectResult
     from orthaug.reports.page_fit import Origin
     from orthaug.reports.result import CheckResult
+    from orthaug.studies.planted import System
 
-DEFAULT_BLOCKS = 4
 PHYSICS_ONLY = "physics alone"
 _TOLD = ("jax", "numpy", "scipy")  # packages whose versions move numbers
 
@@ -88,6 +88,8 @@ class JobPhysics(ABC, Generic[P, F]):
     """Whether `check` computes free runs, for which JAX is needed."""
     most_trials: ClassVar[int]
     """Changes that advice tries: together they take about as long as the fit."""
+    suspects: tuple[Any, ...] = ()
+    """The terms that the physics may lack, as the spec declares them."""
     map: PhysicsMap | None = None
     """The map from physical parameters to θ, where the parameters are not physical themselves."""
 
@@ -109,7 +111,7 @@ class JobPhysics(ABC, Generic[P, F]):
         """Return the problem on a record in memory."""
 
     def pose_part(
-        self, spec: Spec, train: Part, kind: str, engine: Engine, *, require_full_rank: bool
+        self, spec: Spec, train: FilePart, kind: str, engine: Engine, *, require_full_rank: bool
     ) -> tuple[P, tuple[Warning, ...]]:
         """Return the problem on the training data, and warnings on terms that are left out.
 
@@ -144,10 +146,6 @@ class JobPhysics(ABC, Generic[P, F]):
         """Return the runner of independent runs."""
         return Threads()
 
-    def without(self, problem: P, samples: Any) -> str:
-        """Return a sentence on the result of a fit without some samples; "" where that is long."""
-        return ""
-
     @abstractmethod
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         """Return the findings before training, and warnings on them."""
@@ -155,24 +153,6 @@ class JobPhysics(ABC, Generic[P, F]):
     @abstractmethod
     def refusal(self, job: Job, result: CheckResult) -> InputError | None:
         """Return the error of parameters that the data do not determine; None where they do."""
-
-    @abstractmethod
-    def robust(self, fit: F, one_step: Response) -> F:
-        """Return the fit with the standard errors that its residual calls for."""
-
-    def describe(self, fit: F) -> dict[str, Any]:
-        """Return the section of the result that only this physics has."""
-        return {}
-
-    @abstractmethod
-    def analyse(
-        self, job: Job, fit: F, one_step: Response, free_run: Response, warnings: list[Any]
-    ) -> dict[str, Any]:
-        """Return the findings on a fit, with the `budget` of its biases; warnings are added."""
-
-    @abstractmethod
-    def shared(self, job: Job, fit: F) -> tuple[Imitation | None, list[Warning]]:
-        """Return what the learner could imitate, and warnings on what it nearly could."""
 
     @abstractmethod
     def figures(
@@ -188,10 +168,19 @@ class JobPhysics(ABC, Generic[P, F]):
     def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
         """Return the input that a spec asks for."""
 
+    @abstractmethod
+    def system(self, fit: F) -> System:
+        """Return the physics with the parameters of a fit, to simulate with them as the truth."""
+
     @property
     @abstractmethod
     def declared_units(self) -> dict[str, str]:
         """Units of the parameters and fixed terms, as declared, by their names."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that the physics are read from."""
+        return ()
 
     @abstractmethod
     def names_taken(self, spec: Spec) -> set[str]:
@@ -232,9 +221,9 @@ class Job:
 
     path: Path
     spec: Spec
-    train: Part
-    validation: Part | None
-    tests: tuple[Part, ...]
+    train: FilePart
+    validation: FilePart | None
+    tests: tuple[FilePart, ...]
     physics: JobPhysics[Any, Any]
     problem: Any
     measure: Measure
@@ -324,10 +313,27 @@ class Job:
 
     @cached_property
     def _of_samples(self) -> tuple[Warning, ...]:
-        from orthaug.data.wild import data_warnings
+        return tuple(sample_warnings(self.problem))
 
-        without = partial(self.physics.without, self.problem)
-        return tuple(data_warnings(self.train.record, without))
+    @property
+    def evidence(self) -> Evidence:
+        """What a fit of this job is judged by."""
+        spec = self.spec
+        return Evidence(
+            parts=self.parts,
+            problem=self.problem,
+            learner=spec.declared_learner(),
+            structure=spec.declared_structure(),
+            criterion=spec.declared_criterion(),
+            measure=self.measure,
+            noise=spec.noise.declared,
+            suspects=self.physics.suspects,
+            map=self.physics.map,
+            profiles=spec.physics is not None and spec.physics.profile,
+            blocks=spec.validation.blocks,
+            runner=self.runner,
+            warnings=self.warnings,
+        )
 
     @property
     def run_count(self) -> int:
@@ -372,10 +378,11 @@ class Job:
         return (
             self.path,
             *(self.path.parent / entry.file for part in self.parts for entry in part.files),
+            *self.physics.files,
         )
 
     @property
-    def parts(self) -> tuple[Part, ...]:
+    def parts(self) -> tuple[FilePart, ...]:
         """Every part, the training data first."""
         return (self.train, *([self.validation] if self.validation else []), *self.tests)
 
@@ -388,6 +395,9 @@ class Job:
     def fingerprint(self) -> str:
         """Fingerprint of everything that training depends on: the spec, its files, the program."""
         content = {"spec": self.declaration, "data": self.data.model_dump(), "orthaug": __version__}
+        if self.physics.files:
+            read = [hashlib.sha256(file.read_bytes()).hexdigest() for file in self.physics.files]
+            content["physics"] = read
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     @property
@@ -404,7 +414,7 @@ class Job:
 
     def training_options(self, variant: Variant) -> dict[str, Any]:
         """Return the options of training of a variant."""
-        from orthaug.fitting.training import FOLD_ITERATIONS
+        from orthaug.fitting.setup import FOLD_ITERATIONS
 
         fold, spec, training = variant.fold, self.spec, self.spec.training
         solver, choices, blocks = (
@@ -465,23 +475,30 @@ def date_of_results() -> datetime:
     return datetime.fromtimestamp(int(epoch), UTC)
 
 
-def origin_of(job: Job, command: str) -> Origin:
-    """Return the origin of a job's result. SOURCE_DATE_EPOCH, where it is set, is the date."""
+def surroundings() -> tuple[str, str, dict[str, str]]:
+    """Return the date of results, the machine in words, and versions by name."""
     import importlib.metadata
     import platform
+
+    versions = {"orthaug": __version__, "Python": platform.python_version()}
+    versions |= {name: importlib.metadata.version(name) for name in _TOLD}
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return date_of_results().strftime("%Y-%m-%d %H:%M UTC"), machine, versions
+
+
+def origin_of(job: Job, command: str) -> Origin:
+    """Return the origin of a job's result. SOURCE_DATE_EPOCH, where it is set, is the date."""
     import shlex
 
     from orthaug.reports.page_fit import Origin
 
-    now = date_of_results()
-    versions = {"orthaug": __version__, "Python": platform.python_version()}
-    versions |= {name: importlib.metadata.version(name) for name in _TOLD}
+    date, machine, versions = surroundings()
     return Origin(
         name=job.path.stem,
         toml=_toml(job),
         command=shlex.join(("orthaug", *(job.arguments or (command, job.path.name)))),
-        date=now.strftime("%Y-%m-%d %H:%M UTC"),
-        machine=f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        date=date,
+        machine=machine,
         versions=versions,
         seed=job.spec.training.seed,
     )

@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from orthaug.analysis.closed_loop import closed_loop
-from orthaug.commands.attempt import attempt
 from orthaug.commands.job import Job
-from orthaug.reports.result import CheckResult, FitResult, ParameterResult, parameter_rows
+from orthaug.reports.result import CheckResult, FitResult
 
 if TYPE_CHECKING:
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
-
-_FINDINGS = (
-    "physical_parameters",
-    "physical_consistency",
-    "sensitivities",
-    "bias",
-    "residuals",
-    "missing_lags",
-    "stability",
-    "measure_detail",
-)
 
 
 def check(job: Job) -> CheckResult:
@@ -34,6 +20,7 @@ def check(job: Job) -> CheckResult:
     Nothing is stored.
     """
     found, warnings = job.physics.check(job)
+    looped = closed_loop(job.train.record, job.evidence.method)
     return CheckResult.model_validate(
         {
             "data": job.data,
@@ -41,53 +28,13 @@ def check(job: Job) -> CheckResult:
             "regressor": [str(entry) for entry in job.problem.layout],
             "rows": job.problem.count,
             **found,
-            "warnings": [*job.warnings, *warnings, *closed_loop(job.train.record)],
+            "warnings": [
+                *job.warnings,
+                *warnings,
+                *looped,
+            ],
         }
     )
-
-
-def content(
-    job: Job,
-    fit: Any,
-    responses: Mapping[str, tuple[Response, Response]],
-    warnings: list[Any],
-) -> tuple[Any, dict[str, Any]]:
-    """Return the fit and the content of its result; warnings are added.
-
-    The standard errors are the ones that its residual calls for.
-    """
-    fields: dict[str, Any] = dict.fromkeys(_FINDINGS) | job.physics.describe(fit)
-    budget = None
-    if fit.status.ok:
-        plain, (one_step, free_run) = fit, responses[job.train.name]
-        fit = attempt(
-            "the robust covariance", lambda: job.physics.robust(plain, one_step), warnings, plain
-        )
-        warnings += closed_loop(job.train.record)
-        fields |= job.physics.analyse(job, fit, one_step, free_run, warnings)
-        budget = fields.pop("budget")
-    shared, of_shared = job.physics.shared(job, fit)
-    warnings += of_shared
-    split = fit.model.structure == "orthogonal" and fit.learns
-    imitable = shared if split else None  # of the others the split has no directions
-    rows = _with_biases(
-        _parameters(fit), imitable and imitable.determined, budget, held=fit.at_bound
-    )
-    physical = fields["physical_parameters"]
-    if physical is not None:
-        physical = _with_biases(physical, imitable and imitable.physical, budget)
-    return fit, fields | {
-        "parameters": rows,
-        "physical_parameters": physical,
-        "standard_errors": None
-        if fit.std is None
-        else "plain"
-        if fit.plain_covariance is None
-        else "robust",
-        "standard_errors_by": None if fit.std_kind == "plain" else fit.std_kind,
-        "excitation": fit.excitation,
-        "shared": shared,
-    }
 
 
 def figures(
@@ -130,38 +77,3 @@ def physics_alone(
         part.name: job.physics.run_alone(fit, part.record, responses[part.name][1])
         for part in job.parts
     }
-
-
-def _parameters(fit: Any) -> list[ParameterResult]:
-    """Return the parameters as results list them; without values where training failed."""
-    problem = fit.problem
-    values = fit.values if fit.status.ok else np.full(len(problem.names), np.nan)
-    rows = parameter_rows(
-        problem.parameters, values, fit.std, fit.interval, fit.one_step_theta, fit.plain_std
-    )
-    units = problem.derived_units
-    return [
-        row if row.unit else row.model_copy(update={"derived_unit": units.get(row.name)})
-        for row in rows
-    ]
-
-
-def _with_biases(
-    rows: Sequence[ParameterResult],
-    determined: Sequence[str] | None,
-    budget: Any,
-    held: Collection[str] = (),
-) -> list[ParameterResult]:
-    """Return the parameters, with whether the learner could imitate them and what biases them.
-
-    Those `held` at a bound have none.
-    """
-    shared = [
-        None if determined is None or row.name in held else row.name not in determined
-        for row in rows
-    ]
-    biases = [budget.of(row.name) if budget and row.name not in held else None for row in rows]
-    return [
-        row.with_bias(imitated, bias)
-        for row, imitated, bias in zip(rows, shared, biases, strict=True)
-    ]

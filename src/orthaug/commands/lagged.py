@@ -10,51 +10,44 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, Warning
-from orthaug.analysis.imitation import Imitation, imitation
-from orthaug.analysis.measure_bias import LaggedTerms, bias_under
+from orthaug.analysis.evidence import Evidence
+from orthaug.analysis.physics_findings import bias_before, imitable_before
 from orthaug.analysis.suspects import Suspect
-from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.job import Job, JobPhysics, Variant
-from orthaug.commands.parts import Part
+from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec, spec_error
-from orthaug.commands.suspects import check_suspects, declare_suspects
+from orthaug.commands.suspects import declared_suspects
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, largest_lag
 from orthaug.data.sources import RecordSource
-from orthaug.fitting.elimination import directions
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.rules import check_no_memory
 from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
-from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.physics import ill_conditioned
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, regressor_of
 from orthaug.physics.excitation import identifiability, require_rank
 from orthaug.physics.parameters import PhysicsMap, with_initial
-from orthaug.physics.problem import Problem, check_defined, pose, regressor_of
+from orthaug.physics.problem import Problem, check_defined, pose
 from orthaug.physics.streamed import pose_streamed
-from orthaug.reports.result import CheckResult, physical_rows
+from orthaug.reports.result import CheckResult
 
 if TYPE_CHECKING:
-    from orthaug.analysis.budget import Budget
     from orthaug.analysis.design import Design
-    from orthaug.fitting.estimates import Estimate
+    from orthaug.analysis.findings import SuspectResult
+    from orthaug.fitting.lagged_estimate import LaggedEstimate
     from orthaug.models.response import Response
     from orthaug.models.rows import Engine
     from orthaug.reports.drawing import Figure
-    from orthaug.reports.findings import SuspectResult
+    from orthaug.studies.planted import System
 
 _ROWS = 20_000  # of the residual that are looked at
 _SPANNED = 1e-9  # of a term's squares: what is left of it beside the physics where it is physics
-_NOT_ANALYSED = Warning(
-    "residual_not_analysed",
-    "the residual is not analysed: there are too few rows, or it is rounding error only.",
-)
 
 
 @dataclass(frozen=True, eq=False)
-class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
+class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
     """A baseline, what its learner sees, and the physical parameters behind θ."""
 
     baseline: Baseline
@@ -63,6 +56,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
     learner_inputs: tuple[str, ...] | None = None
     weighed: WeighedPhysics | None = None
     """The physics over the points of the job's measure."""
+    suspects: tuple[Suspect, ...] = ()
 
     section: ClassVar[str] = "baseline"
     runs_in_check: ClassVar[bool] = False
@@ -123,7 +117,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
         return change, f"in the physics{f' of {place}' if several else ''}"
 
     def explained_residual(
-        self, fit: Estimate
+        self, fit: LaggedEstimate
     ) -> Callable[[SuspectResult], tuple[float, float]] | None:
         """Return a function that gives the share of the one-step residual that a suspect explains.
 
@@ -169,7 +163,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
         return partial(_pose, posed=posed, output_weights=spec.training.output_weights)
 
     def pose_part(
-        self, spec: Spec, train: Part, kind: str, engine: Engine, *, require_full_rank: bool
+        self, spec: Spec, train: FilePart, kind: str, engine: Engine, *, require_full_rank: bool
     ) -> tuple[Problem, tuple[Warning, ...]]:
         # On a cluster they are its tasks
         several = spec.runs(linear=self.baseline.linear) > 1 and train.source is None
@@ -201,18 +195,18 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
                 f"under the {measure.name} measure the physics cannot distinguish {groups}; "
                 "widen or move it."
             )
-        check_suspects(spec.suspects, problem, weighed)
-        return replace(self, weighed=weighed)
+        suspects = declared_suspects(spec.suspects, problem, weighed)
+        return replace(self, weighed=weighed, suspects=suspects)
 
     def check_record(self, problem: Problem, record: Record) -> None:
         check_defined(problem, record)
 
-    def train(self, problem: Problem, **options: Any) -> Estimate:
+    def train(self, problem: Problem, **options: Any) -> LaggedEstimate:
         return _train(problem, **options)
 
     def fold_training(
         self, job: Job, variant: Variant
-    ) -> tuple[Callable[[Record], Problem], Callable[..., Estimate]]:
+    ) -> tuple[Callable[[Record], Problem], Callable[..., LaggedEstimate]]:
         """Return functions that pose a variant on a fold, and train it.
 
         They can be sent to another process. A fold is small: its rows are in memory.
@@ -225,22 +219,17 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
 
         return runs_on(engine)
 
-    def without(self, problem: Problem, samples: Any) -> str:
-        from orthaug.analysis.wild_effect import fit_without
-
-        return fit_without(problem, samples)
-
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         """Return excitation, identifiability, and bias by suspects, and warnings on these."""
-        problem = job.problem
-        shared, warnings = self.shared(job)
+        problem, evidence = job.problem, job.evidence
+        shared, warnings = imitable_before(problem, evidence)
         found = {
             "excitation": problem.excitation,
             "identifiability": identifiability(
                 problem.baseline, problem.layout, problem.outputs, problem.rows.x
             ),
             "shared": shared,
-            "bias": self._bias(job) if problem.excitation.full_rank else None,
+            "bias": self._bias(evidence) if problem.excitation.full_rank else None,
         }
         return found, [*ill_conditioned.of_physics(problem), *warnings]
 
@@ -251,80 +240,10 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
             return error
         return None
 
-    def robust(self, fit: Estimate, one_step: Response) -> Estimate:
-        """Return the fit with the standard errors that its residual calls for."""
-        from orthaug.analysis.robustness import robust_where_asked
-
-        return robust_where_asked(fit, one_step)
-
-    def describe(self, fit: Estimate) -> dict[str, Any]:
-        """Return the noise model, where one was asked for."""
-        return {"noise": list(fit.noise)} if fit.status.ok and fit.noise else {}
-
-    def analyse(
-        self,
-        job: Job,
-        fit: Estimate,
-        one_step: Response,
-        free_run: Response,
-        warnings: list[Any],
-    ) -> dict[str, Any]:
-        from orthaug.analysis.diagnosis import diagnose
-        from orthaug.analysis.free_run_stability import stability
-        from orthaug.analysis.missing_lags import missing_lags
-
-        problem = fit.problem
-        return {
-            **self._physical(job, fit, warnings),
-            "bias": attempt("the bias by suspects", partial(self._bias, job, fit), warnings, None),
-            "measure_detail": fit.measure,
-            "stability": attempt_warned(
-                "the analysis of the free run's sensitivity",
-                lambda: stability(fit.model, problem.record, response=free_run, x=problem.rows.x),
-                warnings,
-            ),
-            "residuals": attempt_warned(
-                "the analysis of the residual",
-                lambda: diagnose(fit, one_step=one_step, free_run=free_run),
-                warnings,
-                _NOT_ANALYSED,
-            ),
-            "missing_lags": attempt_warned(
-                "the search for missing lags", lambda: missing_lags(fit, one_step), warnings
-            ),
-            "budget": attempt_warned(
-                "the bias that the learner implies", partial(self._budget, job, fit), warnings
-            ),
-        }
-
-    def shared(
-        self, job: Job, fit: Estimate | None = None
-    ) -> tuple[Imitation | None, list[Warning]]:
-        """Return what the learner could imitate, and warnings on what it nearly could.
-
-        None without a learner, or where the structure splits nothing along chosen directions.
-
-        Args:
-            fit: of the job's problem; None for the problem as it was posed, with the effect of
-                other learner inputs.
-        """
-        structure, problem = job.spec.declared_structure(), fit.problem if fit else job.problem
-        splits = structure.projects and structure.shared != "all"
-        if job.spec.declared_learner() is None or not splits:
-            return None, []
-        if not problem.baseline.names or not problem.features.entries:
-            return None, []
-        held = tuple(fit.at_bound) if fit else ()
-        found = imitation(problem, self.map, others=fit is None, held=held)
-        if fit is not None and not (fit.status.ok and fit.learns):
-            return found, []
-        seen = [str(entry) for entry in problem.features.entries]
-        return found, shared_warnings(problem.shared, seen)
-
     def figures(
         self,
         job: Job,
-        fit: Estimate,
+        fit: LaggedEstimate,
         responses: Mapping[str, tuple[Response, Response]],
     ) -> dict[str, Figure]:
         from orthaug.reports import plots
@@ -338,7 +257,7 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
             )
         return drawn
 
-    def run_alone(self, fit: Estimate, record: Record, free_run: Response) -> Response:
+    def run_alone(self, fit: LaggedEstimate, record: Record, free_run: Response) -> Response:
         """Return the free run by the model's physics without its learner, trained beside it."""
         return fit.model.physics_only.simulate(record)
 
@@ -354,70 +273,21 @@ class LaggedPhysics(JobPhysics[Problem, "Estimate"]):
             problem.baseline,
             outputs=problem.outputs,
             inputs=[channel.name for channel in problem.record.inputs],
-            suspects=declare_suspects(job.spec.suspects, problem),
+            suspects=self.suspects,
             noise=tuple(residual.std(axis=0)) if noise is None else noise,
             theta=given if np.all(given) else theta,
             **asked,
         )
 
-    def _physical(self, job: Job, fit: Estimate, warnings: list[Any]) -> dict[str, Any]:
-        """Return the physical parameters of θ̂ and their findings, where the spec has a map.
+    def system(self, fit: LaggedEstimate) -> System:
+        from orthaug.studies.planted import LaggedSystem
 
-        Warnings are added.
-        """
-        if self.map is None:
-            return {}
-        physical, profiles, slopes = fit.physical(self.map), None, None
-        warnings += physical.warnings
-        section = job.spec.physics
-        if section is not None and section.profile and physical.covariance is not None:
-            profiles = {name: fit.physical_profile(self.map, name) for name in physical.names}
-        if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
-            slopes = {
-                name: dict(zip(self.map.theta_names, row, strict=True))
-                for name, row in zip(physical.names, physical.sensitivities, strict=True)
-            }
-        return {
-            "physical_parameters": physical_rows(physical, profiles),
-            "physical_consistency": physical.consistency,
-            "sensitivities": slopes,
-        }
+        return LaggedSystem(fit, self.map)
 
-    def _bias(self, job: Job, fit: Estimate | None = None) -> list[dict[str, Any]]:
-        """Return the table of suspects under the spec's measure.
-
-        After a fit it uses θ and what the learner explains.
-
-        Before a fit it includes the usual suspects, since it shows which measure removes a bias.
-        """
-        if not job.problem.baseline.names:
-            return []
-        terms = self._terms(job, fit)
-        suspects = declare_suspects(job.spec.suspects, terms.problem)
-        return bias_under(terms, suspects, certify_usual=fit is None)
-
-    def _budget(self, job: Job, fit: Estimate) -> Budget | None:
-        """Return the bias that what the learner found implies, under the spec's measure."""
-        from orthaug.analysis.budget import budget_on
-
-        if fit.model.structure != "orthogonal" or not fit.learns:
-            return None
-        terms = self._terms(job, fit)
-        return budget_on(terms, declare_suspects(job.spec.suspects, terms.problem))
-
-    def _terms(self, job: Job, fit: Estimate | None) -> LaggedTerms:
-        problem, weighed, structure = job.problem, self.weighed, job.spec.declared_structure()
-        assert weighed is not None
-        if fit is None:
-            learns = job.spec.declared_learner() is not None
-            along = directions(structure, problem) if learns else None
-            return LaggedTerms(weighed, problem, problem.least_squares, self.map, None, along)
-        # weighed by the errors of the fit, or filtered by its noise model
-        if fit.problem.weight.kind != problem.weight.kind or fit.problem.noise is not None:
-            problem = fit.problem
-            weighed = weigh_problem(job.measure, problem)
-        learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
-        return LaggedTerms(weighed, problem, fit.theta, self.map, learned, fit.model.shared, fit)
+    def _bias(self, evidence: Evidence) -> list[dict[str, Any]]:
+        """Return the table of suspects before training, under the spec's measure."""
+        assert self.weighed is not None
+        return bias_before(evidence, self.weighed)
 
 
 def _is_same(term: Mapping[str, Any], expression: str, place: str | None) -> bool:
@@ -430,7 +300,7 @@ def _pose(record: Record, posed: Any, **options: Any) -> Problem:
     return pose(record, *posed, **options)
 
 
-def _train(problem: Problem, **options: Any) -> Estimate:
+def _train(problem: Problem, **options: Any) -> LaggedEstimate:
     from orthaug.fitting.estimation import fit
 
     return fit(problem, **options)

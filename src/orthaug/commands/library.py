@@ -15,34 +15,25 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
 from orthaug._base.folders import check_new_file, whole_file
-from orthaug.commands.doubts import with_doubts
-from orthaug.commands.fit import (
-    FitReport,
-    fit_job,
-    fit_report,
-    report_of,
-    with_verdict,
-    write_result,
-)
+from orthaug.analysis.doubts import doubt
+from orthaug.analysis.evidence import Evidence
+from orthaug.analysis.examination import with_verdict
+from orthaug.commands.fit import FitReport, fit_job, fit_report, report_of, write_result
 from orthaug.commands.folder import check_folder, check_inputs_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.opening import job_physics, open_job
-from orthaug.commands.parts import Part
+from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import (
-    NoiseSection,
     SelectionSection,
     TrainingSection,
-    ValidationSection,
 )
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.kinds import STRUCTURES
-from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.inference.measures import Training
 from orthaug.models.rows import InMemory
 
 if TYPE_CHECKING:
     from orthaug.commands.compare import Comparison
+    from orthaug.commands.recover import Rehearsal
 
 Spec = str | os.PathLike | Job
 NAME = "fit.report()"
@@ -117,6 +108,53 @@ def compare(
     return comparison
 
 
+def recover(
+    spec: Spec,
+    *,
+    draws: int = 20,
+    seed: int = 0,
+    share: float | None = None,
+    terms: Sequence[str] = ("declared", "usual", "memory"),
+    choices: int | None = None,
+    out: str | os.PathLike | None = None,
+) -> Rehearsal:
+    """Rehearse a fit on simulated data with a known truth, as `orthaug recover` does.
+
+    Args:
+        spec: a spec file, or what `load_spec` returned.
+        draws: data sets that are simulated and fitted.
+        seed: of all random numbers.
+        share: RMS of a planted term over that of the physics in its equation; None for terms as
+            large as what the learner of the fit found.
+        terms: groups of planted terms: "declared" ([[suspects]]), "usual", "memory".
+        choices: draws on which other structures, measures, learner inputs and rows are fitted too;
+            None for the first four.
+        out: folder that keeps each draw as it is made, and result and figure; a second call goes on
+            from there. None to write nothing.
+
+    Returns:
+        `result`, the content of recover.json; `summary()`, what the command prints.
+
+    Raises:
+        InputError: as `fit_spec`; a spec without a learner, a folder with draws of another spec.
+        TrainingError: the fit of the user's data failed.
+    """
+    from orthaug.commands.recover import Asked, DrawFolder, rehearse, write
+
+    asked = Asked(draws, seed, share, terms, choices)
+    check_type(spec, Spec, "spec", "the name of a spec file, or what load_spec returns")
+    check_type(out, str | os.PathLike | None, "out", "the name of a folder, or None")
+    job = spec if isinstance(spec, Job) else open_job(Path(spec))
+    folder = None if out is None else DrawFolder(Path(out))
+    if folder is not None:
+        check_inputs_kept(job, folder.path)
+        folder.check(job)
+    made = rehearse(job, asked, folder)
+    if folder is not None:
+        write(made, folder.path)
+    return made
+
+
 def _open(spec: Spec, out: str | os.PathLike | None) -> tuple[Job, Path | None]:
     """Return the job, and the folder to write, checked."""
     check_type(spec, Spec, "spec", "the name of a spec file, or what load_spec returns")
@@ -154,32 +192,8 @@ class FitFacts:
     """The declarations of a fit, where there is no spec."""
 
     fit: Any
-    suspects: tuple[()] = ()
-    physics: None = None
-    motion: None = None
     training: TrainingSection = field(default_factory=lambda: TrainingSection(fallback=False))
-    validation: ValidationSection = field(default_factory=lambda: ValidationSection(blocks=0))
     selection: SelectionSection = field(default_factory=SelectionSection)
-    noise: NoiseSection = field(default_factory=NoiseSection)
-
-    def declared_learner(self) -> Any:
-        """Return the learner; None without one."""
-        bound = self.fit.model.form.bound
-        return bound.learner if bound.learns else None
-
-    def declared_structure(self, kind: str | None = None, measure: Any = None) -> Any:
-        """Return the kind of structure that was fitted."""
-        return STRUCTURES[kind or self.fit.model.structure]()
-
-    def declared_criterion(self) -> Any:
-        """Return the criterion that was fitted."""
-        return self.fit.criterion
-
-    def declared_solver(self) -> Any:
-        """Return the default solver: physics alone needs no other."""
-        from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-
-        return LevenbergMarquardt()
 
     def model_dump(self, **_: Any) -> dict[str, Any]:
         """Return the declarations that a title is made of."""
@@ -193,7 +207,7 @@ class FitFacts:
 
 
 def page_of(
-    fit: Estimate | MotionEstimate,
+    fit: Estimate,
     path: str | os.PathLike | None = None,
     tests: Mapping[str, Record] | None = None,
 ) -> Page:
@@ -204,11 +218,13 @@ def page_of(
         InputError: a path that cannot be written, records that do not fit.
     """
     place = _check_path(fit, path)
-    job = job_of(fit, {} if tests is None else tests)
+    evidence = Evidence.of(fit, tests=tests, blocks=0)
+    job = job_of(fit, evidence)
     made = replace(
         origin_of(job, "fit"), name="spec", command=f"{NAME} in Python", toml=_account(fit)
     )
-    return _write_page(fit_report(with_doubts(with_verdict(report_of(job, fit))), made), place)
+    report = doubt(with_verdict(report_of(job, fit, evidence)))
+    return _write_page(fit_report(report, made), place)
 
 
 def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None = None) -> Page:
@@ -220,7 +236,7 @@ def page_of_spec(fitted: FitReport, path: str | os.PathLike | None, tests: None 
     return _write_page(fit_report(fitted), place)
 
 
-def _check_path(fit: Estimate | MotionEstimate, path: str | os.PathLike | None) -> Path | None:
+def _check_path(fit: Estimate, path: str | os.PathLike | None) -> Path | None:
     check_type(path, str | os.PathLike | None, "path", "a file's name, or None")
     if path is not None and Path(path).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: a page is HTML; give a name that ends in .html.")
@@ -238,7 +254,7 @@ def _write_page(text: str, path: Path | None) -> Page:
     return Page(text, path)
 
 
-def _account(fit: Estimate | MotionEstimate) -> str:
+def _account(fit: Estimate) -> str:
     """Return the text in the place of the spec."""
     learner = f"learner: {fit.model.form.bound.learner}"
     declared = (fit.problem.record, fit.problem.physics, learner)
@@ -246,24 +262,16 @@ def _account(fit: Estimate | MotionEstimate) -> str:
     return "".join(f"# {line}\n" for text in lines for line in text.splitlines())
 
 
-def job_of(fit: Any, tests: Mapping[str, Record]) -> Job:
+def job_of(fit: Any, evidence: Evidence) -> Job:
     """Return the job of a fit, with as much as the fit knows of it."""
-    if not isinstance(tests, Mapping) or not all(
-        isinstance(record, Record) for record in tests.values()
-    ):
-        raise InputError("`tests` must be records by their names, such as {'steps': record}.")
-    problem = fit.problem
-    named: dict[str, Any] = {
-        "path": Path(NAME),
-        "spec": FitFacts(fit),
-        "validation": None,
-        "problem": problem,
-    }
-    named["train"] = Part("train", problem.record, 0, ())
-    named["tests"] = tuple(
-        Part(f"tests.{name}", fit.model.fitting(record, need_outputs=True), 0, ())
-        for name, record in tests.items()
+    return Job(
+        path=Path(NAME),
+        spec=FitFacts(fit),  # type: ignore[arg-type]  (a spec that knows less)
+        train=FilePart("train", fit.problem.record),
+        validation=None,
+        tests=tuple(FilePart(part.name, part.record) for part in evidence.held_out),
+        physics=job_physics(fit.problem.physics),
+        problem=fit.problem,
+        measure=evidence.measure,
+        engine=InMemory(),
     )
-    measure = getattr(getattr(fit, "measure", None), "measure", None) or Training()
-    physics = job_physics(problem.physics).under(measure, named["spec"], problem)
-    return Job(physics=physics, measure=measure, engine=InMemory(), **named)

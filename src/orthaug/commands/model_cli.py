@@ -20,11 +20,11 @@ from orthaug.commands.program import (
     Missing,
     ModelPath,
     OutFile,
-    OutFolder,
     Prepare,
     Rows,
     Which,
     app,
+    out_folder,
     prepare_jax,
     print_result,
 )
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from orthaug.models.response import Response
 
 
-@app.command()
+@app.command(epilog="Example: orthaug simulate result run.csv --out simulated.csv")
 def simulate(
     model: ModelPath,
     data: DataPath,
@@ -64,7 +64,7 @@ def simulate(
     _write_response(response, opened, out, force, run.notes(opened, initial))
 
 
-@app.command()
+@app.command(epilog="Example: orthaug predict result run.csv --horizon 10 --out predicted.csv")
 def predict(
     model: ModelPath,
     data: DataPath,
@@ -105,7 +105,7 @@ def predict(
     _write_response(response, opened, out, force, [*opened.notes, *notes])
 
 
-@app.command()
+@app.command(epilog="Example: orthaug split result train.csv --measure symmetrized")
 def split(
     model: ModelPath,
     data: Annotated[
@@ -118,18 +118,34 @@ def split(
         ),
     ] = "training",
     rows: Annotated[
-        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each file, half-open.")
+        str | None,
+        typer.Option(
+            "--rows", metavar="A:B", help="Rows of each file, half-open.", show_default="all"
+        ),
     ] = None,
     box: Annotated[
         list[str] | None,
-        typer.Option("--box", metavar="LAG=LOW:HIGH", help="Limits of the uniform measure."),
+        typer.Option(
+            "--box",
+            metavar="LAG=LOW:HIGH",
+            help="Limits of the uniform measure.",
+            show_default="the range of the data",
+        ),
     ] = None,
     samples: Annotated[
-        str | None, typer.Option("--samples", metavar="FILE", help="Points, a column per lag.")
+        str | None,
+        typer.Option(
+            "--samples", metavar="FILE", help="Points, a column per lag.", show_default="none"
+        ),
     ] = None,
     weights: Annotated[
         str | None,
-        typer.Option("--weights", metavar="FILE", help="A column `weight`, a row per row of DATA."),
+        typer.Option(
+            "--weights",
+            metavar="FILE",
+            help="A column `weight`, a row per row of DATA.",
+            show_default="none",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -155,7 +171,7 @@ def split(
     print_result(result, split_text(result), as_json)
 
 
-@app.command()
+@app.command(epilog="Example: orthaug explain result train.csv --degree 2")
 def explain(
     model: ModelPath,
     data: Annotated[
@@ -171,7 +187,10 @@ def explain(
     functions: Annotated[
         list[str] | None,
         typer.Option(
-            "--function", metavar="NAME", help="Function in products, such as abs; may be repeated."
+            "--function",
+            metavar="NAME",
+            help="Function in products, such as abs; may be repeated.",
+            show_default="none",
         ),
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
@@ -197,13 +216,15 @@ def explain(
     print_result(result, explain_text(result), as_json)
 
 
-@app.command()
+@app.command(epilog="Example: orthaug export result --to c --out code")
 def export(
     model: ModelPath,
     to: Annotated[
         str,
         typer.Option(
-            "--to", metavar="TARGET", help="c, casadi, control, fmu, numpy, onnx or latex."
+            "--to",
+            metavar="TARGET",
+            help="c, casadi, control, fmu, numpy, onnx, latex, fmu-parameters or mjcf.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
@@ -223,18 +244,26 @@ def export(
     streams.echo(f"written to {out}")
 
 
-@app.command()
+@app.command(epilog="Example: orthaug linearize result --at 'force = 2' --out linear")
 def linearize(
     model: ModelPath,
     at: Annotated[
         str | None,
         typer.Option(
-            "--at", metavar="'NAME=VALUE, …'", help="Held inputs; outputs or states to fix."
+            "--at",
+            metavar="'NAME=VALUE, …'",
+            help="Held inputs; outputs or states to fix.",
+            show_default="inputs at 0",
         ),
     ] = None,
     data: Annotated[
         Path | None,
-        typer.Option("--data", metavar="DATA|SPEC", help="Measured data to compare with."),
+        typer.Option(
+            "--data",
+            metavar="DATA|SPEC",
+            help="Measured data to compare with.",
+            show_default="none",
+        ),
     ] = None,
     continuous: Annotated[
         str,
@@ -244,7 +273,12 @@ def linearize(
     ] = "zoh",
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR|FILE", help="Folder; or a .json, .png, .pdf or .svg."),
+        typer.Option(
+            "--out",
+            metavar="DIR|FILE",
+            help="Folder; or a .json, .png, .pdf or .svg.",
+            show_default="none",
+        ),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
@@ -273,32 +307,59 @@ def linearize(
         streams.echo(f"\nwritten to {out}")
 
 
-@app.command()
+@app.command(epilog="Example: orthaug track result --data new.csv --training train.csv")
 def track(
     model: ModelPath,
     data: Annotated[
         list[Path] | None,
         typer.Option(
-            "--data", metavar="FILE", help="New data, with a gap between files; may be repeated."
+            "--data",
+            metavar="FILE",
+            help="New data, with a gap between files; may be repeated.",
+            show_default="none",
         ),
     ] = None,
     training: Annotated[
         list[Path] | None,
-        typer.Option("--training", metavar="FILE", help="The files that the model was trained on."),
+        typer.Option(
+            "--training",
+            metavar="FILE",
+            help="The files that the model was trained on.",
+            show_default="those of --state",
+        ),
     ] = None,
     rows: Annotated[
-        str | None, typer.Option("--rows", metavar="A:B", help="Rows of each training file.")
+        str | None,
+        typer.Option(
+            "--rows", metavar="A:B", help="Rows of each training file.", show_default="all"
+        ),
     ] = None,
     forgetting: Annotated[
         float | None,
-        typer.Option("--forgetting", metavar="λ", help="Weight of a row relative to the next one."),
+        typer.Option(
+            "--forgetting",
+            metavar="λ",
+            help="Weight of a row relative to the next one.",
+            show_default="1",
+        ),
     ] = None,
     memory: Annotated[
-        float | None, typer.Option("--memory", metavar="S", help="The same as a time in seconds.")
+        float | None,
+        typer.Option(
+            "--memory",
+            metavar="S",
+            help="The same as a time in seconds.",
+            show_default="without end",
+        ),
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option("--state", metavar="DIR", help="Result of an earlier run, to continue from."),
+        typer.Option(
+            "--state",
+            metavar="DIR",
+            help="Result of an earlier run, to continue from.",
+            show_default="none",
+        ),
     ] = None,
     follows: Annotated[
         bool,
@@ -306,7 +367,7 @@ def track(
             "--follows", help="The new data follow on the state's last row without a gap."
         ),
     ] = False,
-    out: OutFolder = None,
+    out: Annotated[Path | None, out_folder("orthaug-out/track")] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:

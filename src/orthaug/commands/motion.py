@@ -4,39 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
 from orthaug.analysis.suspects import MotionSuspect
-from orthaug.commands.attempt import attempt, attempt_warned
 from orthaug.commands.job import Job, JobPhysics, Variant
-from orthaug.commands.scales import describe_scales
 from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record
+from orthaug.data.scales import describe_scales
 from orthaug.fitting.rules import check_motion_choices, check_solver, choose_regularizations
 from orthaug.inference.measures import Measure, Support
 from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import HOLDS, Motion
-from orthaug.physics.motion_problem import MotionProblem, pose_motion
-from orthaug.reports.result import CheckResult, MeasureResult
+from orthaug.physics.problem import MotionProblem, pose_motion
+from orthaug.reports.result import CheckResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
-    from orthaug.analysis.imitation import Imitation
     from orthaug.analysis.input_timing import Trial
-    from orthaug.fitting.motion_estimates import MotionEstimate
+    from orthaug.fitting.motion_estimate import MotionEstimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
+    from orthaug.studies.planted import System
 
 _STIFF = 20  # substeps from which a motion is called stiff for its sampling
-_NOT_ANALYSED = Warning(
-    "residual_not_analysed",
-    "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
-    "error only.",
-)
 _NOT_RICH = Warning(
     "rich_inputs_run_away",
     "physics alone diverges under rich inputs, so identifiability is computed for the inputs "
@@ -59,10 +54,14 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     def declare(cls, spec: Spec, step: float | None) -> Self:
         assert spec.motion is not None
         try:
-            motion = spec.motion.motion_of(spec.data.inputs, spec.data.outputs)
+            motion = spec.declared_motion()
             motion.check_channels(spec.data.inputs, spec.data.outputs)
         except InputError as error:
-            raise InputError(f"motion: {str(error).removeprefix('motion.')}") from None
+            text = str(error)
+            where = "motion" if spec.motion.source is None else "physics.source"
+            own = text.startswith("controller:")
+            text = text if own else f"{where}: {text.removeprefix('motion.')}"
+            raise InputError(text) from None
         try:
             learner, structure = spec.declared_learner(), spec.declared_structure()
             solver, criterion = spec.declared_solver(), spec.declared_criterion()
@@ -80,10 +79,18 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         """Units of the parameters, as declared, by their names."""
         return {parameter.name: parameter.unit for parameter in self.motion.parameters}
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return () if self.motion.source is None else self.motion.source.files
+
     def names_taken(self, spec: Spec) -> set[str]:
-        section = spec.motion
-        assert section is not None
-        return {*section.states, *section.parameters, *section.define, *section.constants}
+        motion, controller = self.motion, spec.controller
+        others = {name for name, _ in (*motion.definitions, *motion.constants)}
+        taken = {*motion.names_of_states, *motion.names, *others}
+        if controller is not None:
+            taken |= {*controller.outputs, *controller.states, *controller.parameters}
+            taken |= {*controller.define, *controller.constants}
+        return taken
 
     def with_term(
         self, job: Job, name: str, expression: str, place: str | None, initial: float
@@ -95,6 +102,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.physics.suspected_motion import equations_of, usual_places
 
         motion = self.motion
+        if motion.functions is not None:
+            return None
         if place is None:
             places = usual_places(motion)
             place = equations_of(motion)[places[0]] if len(places) == 1 else None
@@ -111,7 +120,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         return change, f"in the equation of {place}"
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
-        if not self.motion.inputs or self.motion.scheme.discrete:
+        if not self.motion.driving or self.motion.scheme.discrete:
             return ()
         return tuple(hold for hold in HOLDS if hold != self.motion.hold)
 
@@ -145,9 +154,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         return replace(self, suspects=declared_terms(spec.suspects, problem))
 
     def train(self, problem: MotionProblem, **options: Any) -> MotionEstimate:
-        from orthaug.fitting.motion_estimation import fit_motion
+        from orthaug.fitting.estimation import fit
 
-        return fit_motion(problem, **options)
+        return fit(problem, **options)
 
     def fold_training(
         self, job: Job, variant: Variant
@@ -161,8 +170,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.analysis.input_timing import dead_times, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
         from orthaug.fitting.segmented_motion import SegmentedMotion
-        from orthaug.inference.motion_split import shared_of_motion
         from orthaug.inference.nearly_shared import shared_warnings
+        from orthaug.inference.splitting import shared_of_motion
         from orthaug.models.learners import nothing_learned
         from orthaug.models.moving import MotionDynamics
 
@@ -176,7 +185,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             )
             scales = describe_scales(problem.record)
             cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
-            remedy = f"it meets a wild sample.{wild}" if wild else f"give others.{cause}"
+            other = f"{problem.grows}." if problem.grows else f"give others.{cause}"
+            remedy = f"it meets a wild sample.{wild}" if wild else other
             raise InputError(
                 f"{job.path}: physics alone has no finite free run from its initial values; "
                 f"{remedy}"
@@ -237,86 +247,6 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"{groups}; {remedy}."
         )
 
-    def robust(self, fit: MotionEstimate, one_step: Response) -> MotionEstimate:
-        """Return the fit with the standard errors that the residual of its free run calls for."""
-        from orthaug.analysis.robustness import robust_free_run
-
-        return robust_free_run(fit)
-
-    def describe(self, fit: MotionEstimate) -> dict[str, Any]:
-        motion, form = fit.problem.motion, fit.model.form
-        return {
-            "motion": {
-                "states": motion.names_of_states,
-                "integrator": motion.integrator,
-                "substeps": form.substeps,
-                "hold": motion.hold,
-                "window": fit.model.window,
-                "parts": (),
-                "substep_bias": None,
-            }
-        }
-
-    def analyse(
-        self,
-        job: Job,
-        fit: MotionEstimate,
-        one_step: Response,
-        free_run: Response,
-        warnings: list[Any],
-    ) -> dict[str, Any]:
-        from orthaug.analysis.diagnosis import diagnose
-        from orthaug.analysis.learned_part import equation_parts
-        from orthaug.analysis.motion_modes import motion_stability
-        from orthaug.analysis.motion_response import substep_bias
-
-        points = fit.reach(job.train.record)
-        x, u = np.split(points, [fit.model.form.states], axis=1)
-        found: dict[str, Any] = {
-            "residuals": attempt_warned(
-                "the analysis of the residual",
-                lambda: diagnose(fit, free_run=free_run),
-                warnings,
-                _NOT_ANALYSED,
-            ),
-            "stability": attempt_warned(
-                "the analysis of the modes",
-                lambda: motion_stability(fit.model, x, u, record=job.train.record),
-                warnings,
-            ),
-        }
-        parts, learns = None, fit.learns
-        if learns:
-            parts = attempt(
-                "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
-            )
-            found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
-        coarse = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
-        found["motion"] = self.describe(fit)["motion"] | {
-            "parts": parts or (),
-            "substep_bias": None if coarse is None else coarse.as_dict(),
-        }
-        table, budget = attempt(
-            "the bias by suspects", lambda: self._biases(fit), warnings, (None, None)
-        )
-        warnings += budget.warnings if budget else ()
-        return found | {"bias": table, "budget": budget}
-
-    def shared(self, job: Job, fit: MotionEstimate) -> tuple[Imitation | None, list[Warning]]:
-        from orthaug.analysis.imitation import MotionImitation
-        from orthaug.inference.nearly_shared import shared_warnings
-
-        if not fit.status.ok or not fit.learns:
-            return None, []
-        seen = [str(entry) for entry in fit.model.form.features]
-        found, form = MotionImitation.of(seen, fit.shared), fit.model.form
-        if form.motion.memory:
-            first = replace(job.train.record, experiments=job.train.record.experiments[:1])
-            found = found.with_memory(
-                form, fit.theta, *np.split(fit.reach(first), [form.states], axis=1)
-            )
-        return found, shared_warnings(fit.shared, seen)
-
     def figures(
         self,
         job: Job,
@@ -371,6 +301,11 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         own = {"parameters": p, "noise": left, "substeps": task.plan.dynamics.substeps}
         return design_motion_input(motion, suspects=self.suspects, **own, **asked)
 
+    def system(self, fit: MotionEstimate) -> System:
+        from orthaug.studies.planted import MotionSystem
+
+        return MotionSystem(fit, self.motion.sampled(fit.problem.record.sampling_time))
+
     def _bias_of_physics(self, job: Job, trial: Trial) -> list[dict[str, Any]] | None:
         """Return the bias that each suspect would cause, with physics alone.
 
@@ -386,23 +321,6 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return None
         table = bias_table(terms, self.suspects or terms.usual())
         return [entry.as_dict() for entry in table if self.suspects or entry.size]
-
-    def _biases(self, fit: MotionEstimate) -> tuple[list[dict[str, Any]] | None, Any]:
-        """Return the table of suspects and of the causes in the budget, and the budget."""
-        from orthaug.analysis.bias import bias_table
-        from orthaug.analysis.budget import budget_on
-        from orthaug.analysis.free_run_bias import linearize_fit
-
-        terms = linearize_fit(fit)
-        if terms is None:
-            return None, None
-        table = bias_table(terms, self.suspects)
-        budget = budget_on(terms, self.suspects, table)
-        listed = {entry.suspect for entry in table}
-        usual = [
-            cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed
-        ]
-        return [entry.as_dict() for entry in (*table, *usual)] or None, budget
 
 
 def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warning]]:

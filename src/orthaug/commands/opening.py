@@ -12,7 +12,7 @@ from orthaug.commands.data_sections import engine_of
 from orthaug.commands.job import Job, JobPhysics
 from orthaug.commands.lagged import LaggedPhysics
 from orthaug.commands.motion import MotionPhysics
-from orthaug.commands.parts import load_parts
+from orthaug.commands.parts import FilePart, load_parts
 from orthaug.commands.spec import Spec, load_spec, spec_error
 from orthaug.data.record import check_channels
 from orthaug.fitting.rules import check_scored, check_sizes
@@ -60,31 +60,55 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
         train = train.without_short(first, least)
         validation = validation and validation.without_short(first, least)
         tests = tuple(part.without_short(first, least) for part in tests)
-        kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
-        engine = engine_of(spec.engine, kind)
-        problem, left_out = physics.pose_part(
-            spec, train, kind, engine, require_full_rank=require_full_rank
+        return pose_job(
+            path, spec, physics, (train, validation, tests), require_full_rank=require_full_rank
         )
-        _check_sizes(spec, problem, engine)
-        entries = [str(entry) for entry in problem.used]
-        place = MeasurePlace(path.parent, entries, problem.record, problem.first_row)
-        measure = spec.declared_measure(place)
-        job = Job(
-            path=path,
-            spec=spec,
-            train=train,
-            validation=validation,
-            tests=tests,
-            physics=physics.under(measure, spec, problem),
-            problem=problem,
-            measure=measure,
-            engine=engine,
-            left_out=left_out,
-        )
-        for part in job.parts:
-            part.check_scorable(problem.first_row, train.record.sampling_time, least)
-            if part is not train:  # `pose` has looked at that
-                physics.check_record(problem, part.record)
+
+
+def pose_job(
+    path: Path,
+    spec: Spec,
+    physics: JobPhysics,
+    parts: tuple[FilePart, FilePart | None, tuple[FilePart, ...]],
+    *,
+    require_full_rank: bool = True,
+) -> Job:
+    """Return the job of a spec on parts of data that are read already.
+
+    Args:
+        physics: as the spec declares it.
+        parts: training, validation and test parts.
+
+    Raises:
+        InputError: data that do not go with the physics, or too few rows.
+    """
+    train, validation, tests = parts
+    _, least = physics.rows_needed(spec)
+    kind = spec.engine_kind([path.parent / entry.file for entry in train.files])
+    engine = engine_of(spec.engine, kind)
+    problem, left_out = physics.pose_part(
+        spec, train, kind, engine, require_full_rank=require_full_rank
+    )
+    _check_sizes(spec, problem, engine)
+    entries = [str(entry) for entry in problem.used]
+    place = MeasurePlace(path.parent, entries, problem.record, problem.first_row)
+    measure = spec.declared_measure(place)
+    job = Job(
+        path=path,
+        spec=spec,
+        train=train,
+        validation=validation,
+        tests=tests,
+        physics=physics.under(measure, spec, problem),
+        problem=problem,
+        measure=measure,
+        engine=engine,
+        left_out=left_out,
+    )
+    for part in job.parts:
+        part.check_scorable(problem.first_row, train.record.sampling_time, least)
+        if part is not train:  # `pose` has looked at that
+            physics.check_record(problem, part.record)
     return job
 
 

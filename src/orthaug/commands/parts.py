@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.lines import plural
@@ -16,28 +18,24 @@ from orthaug.commands.data_sections import PartSection
 from orthaug.commands.spec import Spec
 from orthaug.data.clock import DRIFT, read_clock, thinned_fault
 from orthaug.data.parquet_source import open_parquet
+from orthaug.data.part import Part
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
-from orthaug.data.sources import Source, witness
+from orthaug.data.sources import witness
 from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
 from orthaug.reports.result import FileResult
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """A part of the data: its record, and the leading samples of each recording not scored."""
+class FilePart(Part):
+    """A part of the data that was read from files."""
 
-    name: str
-    record: Record
-    skip: int
-    files: tuple[FileResult, ...]
+    files: tuple[FileResult, ...] = ()
     warnings: tuple[Warning, ...] = ()
     """Warnings on rows that were thinned out, or left out around missing samples."""
-    source: Source | None = None
-    """All rows of the part, where its record is only a subsample of them."""
 
-    def without_short(self, first: int, least: int = 0) -> Part:
+    def without_short(self, first: int, least: int = 0) -> FilePart:
         """Return the part without stretches between missing samples that are too short.
 
         They have no row after the first `first`.
@@ -53,13 +51,6 @@ class Part:
         warning = Warning("missing_rows", f"{self.name}: {gaps}")
         return replace(self, record=record, warnings=(*self.warnings, warning))
 
-    @property
-    def skips(self) -> tuple[int, ...]:
-        """Return how many leading samples of each experiment are not scored."""
-        return tuple(
-            max(0, self.skip - experiment.offset) for experiment in self.record.experiments
-        )
-
     def scored(self, start: int) -> Record:
         """Return the record of the scored rows and their lags; the first usable row is `start`."""
         kept = tuple(
@@ -70,7 +61,7 @@ class Part:
 
     def check_scorable(self, start: int, sampling_time: float, least: int = 0) -> None:
         """Raise InputError for an experiment with too few rows, or another sampling time."""
-        if not same_step(self.record.sampling_time, sampling_time):
+        if self.record.even and not same_step(self.record.sampling_time, sampling_time):
             raise InputError(
                 f"data.{self.name}: sampled every {self.record.sampling_time:g} s, the "
                 f"training data every {sampling_time:g} s; one model has one sampling time."
@@ -124,7 +115,7 @@ def long_stretches(
     )
 
 
-def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, ...]]:
+def load_parts(path: Path, spec: Spec) -> tuple[FilePart, FilePart | None, tuple[FilePart, ...]]:
     """Return training, validation and test parts of the spec at `path`, unprepared."""
     files = [path.parent / file for file in expand_files(path, spec.data.train.files, "train")]
     stays = spec.engine_kind(files) in ("stream", "dask") and not spec.brought
@@ -136,7 +127,14 @@ def load_parts(path: Path, spec: Spec) -> tuple[Part, Part | None, tuple[Part, .
         _load(path, spec, part, f"tests.{name}", stays=stays)
         for name, part in spec.data.tests.items()
     ]
-    return train, validation, tuple(tests)
+    parts = [train, *([validation] if validation else []), *tests]
+    if not all(part.record.even for part in parts):
+        train, validation, *tests = (
+            part and replace(part, record=part.record.with_steps())
+            for part in (train, validation, *tests)
+        )
+    assert train is not None
+    return train, validation, tuple(part for part in tests if part)
 
 
 def expand_files(path: Path, entries: Sequence[str], name: str) -> list[str]:
@@ -165,7 +163,7 @@ def expand_files(path: Path, entries: Sequence[str], name: str) -> list[str]:
     return found
 
 
-def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> Part:
+def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool = False) -> FilePart:
     """Return a part with its files read.
 
     Messages begin with the file at fault, after reading by its name in the spec.
@@ -197,6 +195,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
             every=part.every,
             prepare=spec.data.steps,
+            uneven=spec.motion is not None,
         )
         results.append(
             FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))
@@ -223,14 +222,27 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     warnings += _guessed_encoding(path, files, name)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
+    if not record.even:
+        warnings += (_uneven_steps(name, record),)
     if name == "train":
         warnings += warnings_of(record.prepared, [c.name for c in record.channels])
-    return Part(name, record, part.skip, tuple(results), warnings)
+    return FilePart(name, record, part.skip, files=tuple(results), warnings=warnings)
+
+
+def _uneven_steps(name: str, record: Record) -> Warning:
+    """Return the warning that instants are uneven, and what that means for a motion."""
+    steps = np.concatenate([e.steps[:-1] for e in record.experiments if e.steps is not None])
+    text = (
+        f"{name}: steps of time are uneven, {steps.min():.3g} to {steps.max():.3g} s, "
+        f"{steps.mean():.3g} s on average. The motion steps from each instant to the next, with "
+        "its inputs as `hold` says. Tests of the residual count samples, not seconds."
+    )
+    return Warning("uneven_steps", text)
 
 
 def _open_in_files(
     path: Path, spec: Spec, part: PartSection, name: str, files: Sequence[str]
-) -> Part:
+) -> FilePart:
     """Return a part whose rows remain in its Parquet files."""
     if spec.data.prepare:
         raise InputError(
@@ -268,7 +280,7 @@ def _open_in_files(
             "spread over them."
         )
         warnings += (Warning("witness", text),)
-    return Part(name, record, part.skip, tuple(results), warnings, source)
+    return FilePart(name, record, part.skip, source, tuple(results), warnings)
 
 
 def _options(spec: Spec, part: PartSection) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from collections.abc import Sequence, Set
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,7 +21,7 @@ from orthaug.commands import streams
 from orthaug.commands.signals import WATCH, ending_message
 
 if TYPE_CHECKING:
-    from orthaug.reports.fields import Content
+    from orthaug._base.content import Content
 
 
 class Interrupted(Exception):
@@ -35,6 +36,18 @@ class OutputClosed(Exception):
 
 
 class _Group(typer.core.TyperGroup):
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands in groups, each with the first line of its help."""
+        width = max(map(len, self.commands))
+        for heading, names in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [
+                        (f"{name:<{width}}", self.commands[name].get_short_help_str(_SHORT))
+                        for name in names
+                    ]
+                )
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
@@ -92,6 +105,16 @@ def _repeat_options(args: Sequence[str], lists: Set[str], valued: Set[str]) -> l
     return [word for part in found for word in part]
 
 
+GROUPS = {
+    "Commands": ("demo", "init", "app"),
+    "Commands on a spec": ("check", "fit", "compare", "select", "design", "recover"),
+    "Commands on a saved model": (
+        *("simulate", "predict", "split", "explain", "linearize", "track", "export"),
+    ),
+    "Commands on the tool": ("schema", "reproduce", "benchmark"),
+}
+"""The commands as `orthaug --help` lists them: in the order of work."""
+_SHORT = 100  # characters of the first line of a command's help: none is cut
 app = typer.Typer(
     name="orthaug",
     cls=_Group,
@@ -117,9 +140,16 @@ Which = Annotated[
 DataPath = Annotated[
     Path, typer.Argument(metavar="DATA", help="Data file with the model's channels.")
 ]
-OutFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Result folder.")]
+
+
+def out_folder(default: str) -> Any:
+    """Return the option `--out` of a command, with its default in words."""
+    return typer.Option("--out", metavar="DIR", help="Result folder.", show_default=default)
+
+
 OutFile = Annotated[
-    Path | None, typer.Option("--out", metavar="FILE", help="CSV file; standard output by default.")
+    Path | None,
+    typer.Option("--out", metavar="FILE", help="CSV file.", show_default="standard output"),
 ]
 Initial = Annotated[
     str | None,
@@ -127,6 +157,7 @@ Initial = Annotated[
         "--initial",
         metavar="measured|zero|INIT",
         help="Outputs before the first step; INIT is a CSV.",
+        show_default="measured",
     ),
 ]
 Missing = Annotated[
@@ -136,13 +167,17 @@ Missing = Annotated[
     ),
 ]
 Rows = Annotated[
-    str | None, typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.")
+    str | None,
+    typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.", show_default="all"),
 ]
 Every = Annotated[int, typer.Option("--every", metavar="N", help="Keep each N-th row.")]
 Columns = Annotated[
     list[str] | None,
     typer.Option(
-        "--column", metavar="NAME=COLUMN", help="The file's column of a channel; may be repeated."
+        "--column",
+        metavar="NAME=COLUMN",
+        help="The file's column of a channel; may be repeated.",
+        show_default="the channel's column in training",
     ),
 ]
 Prepare = Annotated[
@@ -150,6 +185,7 @@ Prepare = Annotated[
     typer.Option(
         "--prepare/--no-prepare",
         help="Prepare the rows as the training data were, by the model's steps.",
+        show_default="no",
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files, whoever wrote them.")]
@@ -162,31 +198,30 @@ def main() -> None:
         code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()
     except InputError as error:
-        _fail(f"error: {error}", 2)
+        fail("error", str(error), 2, None if error.in_result else error.code)
     except TrainingError as error:
-        _fail(f"training failed: {error}", 1)
+        fail("training failed", str(error), 1, None if error.in_result else error.code)
     except (Interrupted, KeyboardInterrupt) as interrupt:
         during, then = (*map(str, interrupt.args), "", "")[:2]
-        _fail(ending_message("interrupted", during, then=then), 130)
+        fail("", ending_message("interrupted", during, then=then), 130, "interrupted")
     except (OutputClosed, BrokenPipeError):
         streams.silence(sys.stdout)
         sys.exit(0)
     except OSError as error:
-        streams.silence(sys.stdout)
+        if error.filename is None:
+            streams.silence(sys.stdout)
         what = error.filename or "standard output"
-        _fail(
-            "error: "
-            f"{InputError(f'{what}: cannot be read or written ({error.strerror or error}).')}",
-            2,
-        )
+        text = str(InputError(f"{what}: cannot be read or written ({error.strerror or error})."))
+        fail("error", text, 2, "file_failed")
     except Exception as error:
         text = _complaint(error)
         if text is None:
             raise
-        _fail(
-            text if text.startswith("Usage") else f"error: {' '.join(text.split())}",
-            getattr(error, "exit_code", 2),
-        )
+        usage = hasattr(error, "format_message")
+        own = text if text.startswith("Usage") else " ".join(text.split())
+        before = "" if text.startswith("Usage") else "error"
+        code = "usage" if usage else "no_memory" if "memory" in text else "no_device"
+        fail(before, own, getattr(error, "exit_code", 2), code)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -227,8 +262,17 @@ def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
+    run_fmu: Annotated[
+        bool,
+        typer.Option(
+            "--run-fmu", help="Run the native code of an FMU in a saved model that you trust."
+        ),
+    ] = False,
 ) -> None:
     """Set the options before a command: -v, -vv or ORTHAUG_LOG ask for the log."""
+    from orthaug.physics.consent import CONSENTS
+
+    CONSENTS.to_all, CONSENTS.kept = run_fmu, not run_fmu
     level, levels = os.environ.get("ORTHAUG_LOG", "").lower(), ("info", "debug")
     if verbose or level:
         from orthaug._base.progress import show_log
@@ -238,14 +282,49 @@ def options(
         )
 
 
-def _fail(message: str, code: int) -> None:
+def fail(before: str, text: str, exit_code: int, code: str | None) -> None:
+    """Say an error on standard error, and where `--json` is given on standard output as JSON.
+
+    Args:
+        before: the word before it for people.
+        code: that for programs; None for an error that a printed result has told already.
+    """
     WATCH.hold()
-    streams.say(message)
-    sys.exit(code)
+    streams.say(f"{before}: {text}" if before else text)
+    if code is not None and _asks_for_json(sys.argv[1:]):
+        from orthaug.reports.failure import FailureResult
+
+        with suppress(OSError, ValueError):
+            streams.echo(FailureResult.of(code, text).to_json())
+    sys.exit(exit_code)
 
 
-def print_result(result: Content, text: str, as_json: bool, place: object = None) -> None:
-    """Print a result on standard output, as JSON or in words; then the place that was written."""
+def _asks_for_json(given: Sequence[str]) -> bool:
+    """Return whether arguments have `--json` among the options.
+
+    Examples:
+        >>> _asks_for_json(["fit", "a.toml", "--json"]), _asks_for_json(["fit", "--", "--json"])
+        (True, False)
+    """
+    return "--json" in given[: given.index("--") if "--" in given else len(given)]
+
+
+def print_result(
+    result: Content,
+    text: str,
+    as_json: bool,
+    place: object = None,
+    failure: InputError | TrainingError | None = None,
+) -> None:
+    """Print a result on standard output, as JSON or in words; then the place that was written.
+
+    A `failure` that the command ends with is its `error` in JSON.
+    """
+    if failure is not None and as_json:
+        from orthaug.reports.failure import FailureResult
+
+        error = FailureResult.of(failure.code, str(failure)).error
+        result, failure.in_result = result.model_copy(update={"error": error}), True
     written = f"\n\nwritten to {place}" if place is not None else ""
     if place in PARTIALS.overtaken:
         streams.say(

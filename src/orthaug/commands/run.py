@@ -227,6 +227,7 @@ def record_for(
         columns=reading.columns,
         missing=reading.missing,
         prepare=steps,
+        uneven=model.form.steps_unevenly,
     )
 
 
@@ -454,6 +455,8 @@ def _table(response: Response, opened: ModelOnData) -> Any:
     ]
     whole = pd.concat(placed).reindex(range(opened.rows))
     first = stretches[0]
+    if not opened.record.even:
+        return whole  # the instants of rows that were left out are not known here
     time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
     return whole.assign(time=whole["time"].fillna(pd.Series(time)))
 
@@ -480,10 +483,9 @@ def explain_model(
         InputError: physics alone, data without what the learner is evaluated at, too many
             candidates.
     """
+    from orthaug.analysis.attempt import attempt
+    from orthaug.analysis.doubts import memory_result
     from orthaug.analysis.hidden_state import structure_test
-    from orthaug.commands.attempt import attempt
-    from orthaug.commands.doubts import memory_result
-    from orthaug.reports.fields import WarningResult
     from orthaug.selection.explanation import explain
 
     try:
@@ -500,5 +502,5 @@ def explain_model(
         "the search for memory", lambda: structure_test(opened.model, opened.record), failed, None
     )
     memory = [memory_result(one) for one in test.families if one.sure] if test is not None else []
-    warnings = [*result.warnings, *map(WarningResult.model_validate, failed)]
+    warnings = [*result.warnings, *failed]
     return result.model_copy(update={"memory": memory, "warnings": warnings})

@@ -7,9 +7,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from orthaug._base.content import Content
+from orthaug.reports.benchmark import BenchmarkResult
 from orthaug.reports.explanation import ExplainResult
-from orthaug.reports.fields import Content
+from orthaug.reports.failure import FailureResult
 from orthaug.reports.linear import LinearizeResult
+from orthaug.reports.recovery import RecoverResult
 from orthaug.reports.result import CheckResult, CompareResult, DesignResult, FitResult, SplitResult
 from orthaug.reports.selection import SelectResult
 from orthaug.reports.tracking import TrackResult
@@ -20,12 +23,15 @@ RESULTS: dict[str, type[Content]] = {
     "compare": CompareResult,
     "split": SplitResult,
     "design": DesignResult,
+    "recover": RecoverResult,
     "select": SelectResult,
     "explain": ExplainResult,
     "linearize": LinearizeResult,
     "track": TrackResult,
+    "benchmark": BenchmarkResult,
+    "error": FailureResult,
 }
-"""Contents of results by command."""
+"""Contents of results by command, and of an error of any command with `--json`."""
 
 
 def schema_of(command: str) -> dict[str, Any]:

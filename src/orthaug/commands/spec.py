@@ -9,16 +9,31 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError, create_model, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    model_validator,
+)
 
-from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.errors import InputError, KeyedError, SpecError
 from orthaug._base.registry import resolve
-from orthaug.commands.data_sections import Data, EngineSection, MotionSection, Range
+from orthaug.commands.controller_section import ControllerSection
+from orthaug.commands.data_sections import (
+    Data,
+    EngineSection,
+    MotionSection,
+    Range,
+    SourceSection,
+)
 from orthaug.commands.sections import (
     Count,
     Finite,
@@ -35,7 +50,7 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
-from orthaug.fitting.noise import ARMA, UNAVAILABLE, Noise, Order
+from orthaug.fitting.noise import ARMA, OF_LAGGED, OF_MOTIONS, Innovations, Noise, Order
 from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
 from orthaug.fitting.structures import Structure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
@@ -45,7 +60,9 @@ from orthaug.models.learners import Learner
 from orthaug.models.terms import over_lags
 from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.integrators import INTEGRATORS
+from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.source_kinds import SOURCES, discover
 
 Orders = Count | list[Count]
 Regularization = (
@@ -220,17 +237,15 @@ class NoiseSection(Section):
     ma: Count | Literal["auto"] | None = None
     largest: Positive = 4
 
-    @model_validator(mode="after")
-    def _is_available(self) -> NoiseSection:
-        if self.model == "innovations":
-            raise ValueError(f"`noise.model` = innovations {UNAVAILABLE}")
-        return self
-
     @property
     def declared(self) -> Noise:
         """The declaration for `estimate`."""
         if self.model == "white":
             return "white"
+        if self.model == "innovations":
+            return Innovations()
+        if self.model == "auto" and self.model_fields_set <= {"model"}:
+            return "auto"  # among which noise models depends on the physics
         absent: Order = 1 if self.model == "arma" else "auto"
         ar: Any = absent if self.ar is None else self.ar
         ma: Any = absent if self.ma is None else self.ma
@@ -273,6 +288,7 @@ class Spec(Section):
     baseline: BaselineSection | None = None
     physics: PhysicsSection | None = None
     motion: MotionSection | None = None
+    controller: ControllerSection | None = None
     suspects: list[SuspectSection] = []
     design: DesignSection | None = None
     learner: LearnerSection = LearnerSection()
@@ -282,9 +298,29 @@ class Spec(Section):
     validation: ValidationSection = ValidationSection()
     selection: SelectionSection = SelectionSection()
     engine: EngineSection = EngineSection()
+    _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="before")
+    @classmethod
+    def _move_source(cls, content: Any) -> Any:
+        return with_source_in_motion(content)
+
+    @model_validator(mode="after")
+    def _place(self, info: ValidationInfo) -> Spec:
+        self._folder = (info.context or {}).get("folder", Path())
+        return self
+
+    @property
+    def folder(self) -> Path:
+        """The folder from which the spec names files."""
+        return self._folder
 
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:
+        for name in ("states", "outputs", "parameters"):
+            motion = self.motion
+            if motion is not None and motion.source is None and name not in motion.model_fields_set:
+                raise ValueError(f"the key 'motion.{name}' is missing")
         if self.motion is None and self.baseline is None:
             raise ValueError(
                 "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead"
@@ -292,6 +328,12 @@ class Spec(Section):
         for name in ("baseline", "lags", "physics") if self.motion is not None else ():
             if name in self.model_fields_set:
                 raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
+        if self.controller is not None and self.motion is None:
+            raise ValueError(
+                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
+                'one with `integrator` = "discrete", or leave it out and estimate one step '
+                'ahead with `noise.model` = "arma"'
+            )
         wrong = self.declared_physics.foreign_keys
         for i, section in enumerate(self.suspects):
             for key in sorted(section.model_fields_set & wrong.keys()):
@@ -327,10 +369,10 @@ class Spec(Section):
             return self
         found = f"`noise.model`: found {self.noise.model}"
         if self.motion is not None:
-            raise ValueError(
-                f"{found} beside [motion]; expected white, because a motion has white noise on its "
-                "outputs"
-            )
+            self._check_noise_of_motion(found)
+            return self
+        if self.noise.model == "innovations":
+            raise ValueError(f"`noise.model` = innovations {OF_MOTIONS}")
         criterion, solver = self.declared_criterion(), self.declared_solver()
         if criterion.free_run is not None:
             raise ValueError(
@@ -350,6 +392,22 @@ class Spec(Section):
                 "filter of a noise model needs all rows in their order"
             )
         return self
+
+    def _check_noise_of_motion(self, found: str) -> None:
+        """Raise ValueError for a noise model that the motion cannot have."""
+        if self.noise.model == "arma" or self.noise.model_fields_set - {"model"}:
+            what = "" if self.noise.model == "arma" else "; `ar`, `ma` and `largest` are of `arma`"
+            raise ValueError(f"{found} beside [motion]{what}: `noise.model` = arma {OF_LAGGED}")
+        if self.controller is not None:
+            raise ValueError(
+                f"{found} beside [controller]; expected white, or no controller: the predictor "
+                "follows the measured outputs, so give the plant's own input"
+            )
+        if self.engine.kind not in ("auto", "memory"):
+            raise ValueError(
+                f"{found} beside `engine.kind` = {self.engine.kind}; expected memory, where a "
+                "predictor follows the outputs"
+            )
 
     @property
     def declared_physics(self) -> BaselineSection | MotionSection:
@@ -384,6 +442,18 @@ class Spec(Section):
             for t in self.baseline.terms
         ]
         return Baseline.from_terms(terms, self.baseline.constants)
+
+    def declared_motion(self) -> Motion:
+        """Return the motion, in the loop of its controller where there is one.
+
+        Raises:
+            InputError: what cannot be declared.
+        """
+        assert self.motion is not None, "lagged physics have no motion"
+        inputs, outputs = self.data.inputs, self.data.outputs
+        if self.controller is None:
+            return self.motion.motion_of(inputs, outputs, self.folder)
+        return self.controller.around(self.motion, inputs, outputs, self.folder)
 
     def physics_map(self, sampling_time: float) -> PhysicsMap | None:
         """Return the physical parameters and their map to θ, if the spec has one.
@@ -486,9 +556,31 @@ class Spec(Section):
         )
 
 
+def with_source_in_motion(content: Any) -> Any:
+    """Return the content of a spec with `[physics.source]` in `[motion]`, where other code has it.
+
+    Raises:
+        ValueError: a source beside other physics.
+    """
+    physics = content.get("physics") if isinstance(content, Mapping) else None
+    if not isinstance(physics, Mapping) or "source" not in physics:
+        return content
+    beside = next((key for key in physics if key != "source"), None)
+    if beside is not None:
+        raise ValueError(
+            f"`physics.{beside}`: found beside [physics.source]; expected none, because the source "
+            "has parameters of its own"
+        )
+    motion = content.get("motion", {})
+    if not isinstance(motion, Mapping):
+        return content
+    others = {name: section for name, section in content.items() if name != "physics"}
+    return others | {"motion": {**motion, "source": physics["source"]}}
+
+
 def spec_error(error: KeyedError) -> InputError:
     """Return an error in one key of a declaration in the words of a spec."""
-    return InputError(f"'{_SECTIONS.get(error.key, f'training.{error.key}')}'{error.words}.")
+    return SpecError(f"'{_SECTIONS.get(error.key, f'training.{error.key}')}'{error.words}.")
 
 
 def spec_model() -> type[Spec]:
@@ -496,7 +588,15 @@ def spec_model() -> type[Spec]:
     return _spec_model(
         tuple(
             tuple(registry.items())
-            for registry in (LEARNERS, MEASURES, STRUCTURES, SOLVERS, CRITERIA, INTEGRATORS)
+            for registry in (
+                LEARNERS,
+                MEASURES,
+                STRUCTURES,
+                SOLVERS,
+                CRITERIA,
+                INTEGRATORS,
+                SOURCES,
+            )
         )
     )
 
@@ -511,8 +611,15 @@ def _spec_model(registered: object) -> type[Spec]:
         "training": with_kinds(TrainingSection),
     }
     fields: dict[str, Any] = {name: (section, section()) for name, section in sections.items()}
-    fields["motion"] = (with_kinds(MotionSection) | None, None)
+    source = (with_kinds(SourceSection) | None, None)
+    fields["motion"] = (with_kinds(MotionSection, source=source) | None, None)
     return create_model("Spec", __base__=Spec, **fields)
+
+
+def _as_validated(content: dict[str, Any]) -> dict[str, Any]:
+    with suppress(ValueError):
+        return with_source_in_motion(content)
+    return content
 
 
 def load_spec(path: Path) -> Spec:
@@ -525,20 +632,24 @@ def load_spec(path: Path) -> Spec:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
+        raise SpecError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected TOML in UTF-8.") from None
+        raise SpecError(f"{path}: not a text file; expected TOML in UTF-8.") from None
     except RecursionError:
-        raise InputError(f"{path}: broken TOML: tables or lists are nested too deeply.") from None
+        raise SpecError(f"{path}: broken TOML: tables or lists are nested too deeply.") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
+        raise SpecError(f"{path}: cannot be read ({error.strerror}).") from None
     except ValueError as error:  # a whole number of thousands of digits
-        raise InputError(f"{path}: broken TOML: {str(error).split(';')[0]}.") from None
+        raise SpecError(f"{path}: broken TOML: {str(error).split(';')[0]}.") from None
+    physics = content.get("physics")
+    if isinstance(physics, Mapping) and "source" in physics:
+        discover()
     model = spec_model()
     try:
-        return model.model_validate(content)
+        return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        message = first_message(error, content, model)
-        raise InputError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
+        message = first_message(error, _as_validated(content), model)
+        message = message.replace("motion.source", "physics.source")
+        raise SpecError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
     except RecursionError:
-        raise InputError(f"{path}: tables or lists are nested too deeply.") from None
+        raise SpecError(f"{path}: tables or lists are nested too deeply.") from None

@@ -14,6 +14,7 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
+from orthaug.analysis.fit_findings import MeasureResult, parameter_rows
 from orthaug.commands.folder import results_beside
 from orthaug.commands.run import (
     ModelOnData,
@@ -25,13 +26,13 @@ from orthaug.commands.run import (
 )
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
-from orthaug.fitting.any_fit import STD_KINDS, WITHHELD
+from orthaug.fitting.estimates import STD_KINDS, WITHHELD
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure, Support
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
-from orthaug.reports.result import MeasureResult, SplitResult, parameter_rows
+from orthaug.reports.result import SplitResult
 
 _UNKNOWN = Warning("no_statistics", "no standard errors: training left no statistics.")
 
@@ -214,7 +215,7 @@ def _split_lagged(
 def _split_motion(
     model: Model[MotionDynamics], record: Record, measure: Measure, warnings: Sequence[Warning]
 ) -> SplitResult:
-    from orthaug.fitting.motion_estimation import reopen_estimate
+    from orthaug.fitting.conclusion import reopen_estimate
 
     fit = reopen_estimate(model, record).split(measure)
     split, (parameters, values) = fit.split_by, fit.model.estimated

@@ -48,9 +48,21 @@ def prepare() -> None:
         stream = getattr(sys, name)
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="orthaug.plain")
+    fit_screen(_columns())
+
+
+def _columns() -> int:
+    """Return the columns that lines may have: `COLUMNS`, else those of the terminal.
+
+    0 where neither is known, as in pipes and files, where lines stay what tests and programs know.
+    """
+    given = os.environ.get("COLUMNS", "")
+    if given.isdecimal() and int(given) > 0:
+        return int(given)
     with suppress(OSError, ValueError, AttributeError):
-        if sys.stdout.isatty():  # in pipes and files lines stay what tests and programs know
-            fit_screen(os.get_terminal_size(sys.stdout.fileno()).columns)
+        if sys.stdout.isatty():
+            return os.get_terminal_size(sys.stdout.fileno()).columns
+    return 0
 
 
 def plain(error: UnicodeError) -> tuple[str, int]:

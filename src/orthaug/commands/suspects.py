@@ -19,17 +19,19 @@ from orthaug.commands.spec import SuspectSection
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.inference.measures import WeighedPhysics
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_problem import MotionProblem
-from orthaug.physics.problem import Problem
+from orthaug.physics.problem import MotionProblem, Problem
 
 
-def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tuple[Suspect, ...]:
-    """Return the suspects of a spec.
+def declared_suspects(
+    sections: Sequence[SuspectSection], problem: Problem, weighed: WeighedPhysics
+) -> tuple[Suspect, ...]:
+    """Return the suspects of a spec, as terms of lagged physics under a measure.
 
     A width that is not given is the median size of what the term acts on.
 
     Raises:
-        InputError: an unknown kind, channel or lag, an expression that cannot be read.
+        InputError: an unknown kind, channel or lag, an expression that cannot be read, or without
+            a value on some training row or, with memory, at the points of the measure.
     """
     constants = {SAMPLING_TIME: problem.record.sampling_time} | dict(problem.baseline.constants)
     only = problem.outputs[0] if len(problem.outputs) == 1 else None
@@ -47,21 +49,11 @@ def declare_suspects(sections: Sequence[SuspectSection], problem: Problem) -> tu
             "name": section.name,
         }
         suspects.append(Suspect.of(section.kind, section.on, constants=constants, **options))
-    return tuple(suspects)
-
-
-def check_suspects(
-    sections: Sequence[SuspectSection], problem: Problem, weighed: WeighedPhysics
-) -> None:
-    """Raise InputError for suspects that cannot be read or have no value.
-
-    They need one on every training row, and one with memory at the points of the measure.
-    """
-    suspects = declare_suspects(sections, problem)
     suspect_columns(suspects, problem.rows.x, problem.layout, problem.outputs, problem.lengths)
     if weighed.points.x is not problem.rows.x:
         hidden = [suspect for suspect in suspects if suspect.memory is not None]
         suspect_columns(hidden, weighed.points.x[:1], problem.layout, problem.outputs)
+    return tuple(suspects)
 
 
 def declared_terms(

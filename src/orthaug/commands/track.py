@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
+from orthaug.analysis.fit_findings import parameter_rows, physical_rows
 from orthaug.commands.folder import results_beside
 from orthaug.commands.run import ReadOptions, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.reports.result import FileResult, parameter_rows, physical_rows
+from orthaug.reports.result import FileResult
 from orthaug.reports.tracking import TrackResult
 
 if TYPE_CHECKING:

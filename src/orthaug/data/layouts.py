@@ -96,7 +96,8 @@ def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
 
     Args:
         columns: names that are asked for. A first line of numbers is a header only where it holds
-            all of them.
+            all of them. A column whose cell of the header is empty may be asked for by its place,
+            as x3.
 
     Raises:
         InputError: what is no text, or only blank lines.
@@ -192,8 +193,21 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
             encoding,
             False,
         )
-    names, number = _below_remarks(rows, separator)
-    return Layout([name.strip() for name in names], number, separator, encoding)
+    cells, number = _below_remarks(rows, separator)
+    names = _with_places([name.strip() for name in cells], columns)
+    return Layout(names, number, separator, encoding)
+
+
+def _with_places(names: list[str], columns: Sequence[str]) -> list[str]:
+    """Return names in which x3 is the third column, where that is asked for and the cell is empty.
+
+    A name that the header has itself stays its own.
+    """
+    wanted = set(columns) - set(names)
+    return [
+        f"x{place}" if not name and f"x{place}" in wanted else name
+        for place, name in enumerate(names, start=1)
+    ]
 
 
 def _has_numbers(line: str) -> bool:

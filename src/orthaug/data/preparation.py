@@ -199,11 +199,15 @@ def prepare(record: Record, *steps: Any) -> Record:
     check_type(record, Record, "record", "a Record")
     check_steps(steps)
     runs = []
+    if not record.even and not (steps and isinstance(steps[0], Resample)):
+        record.check_even("preparation whose first step is not Resample()")
     for e in record.experiments:
-        instants = e.start_time + record.sampling_time * np.arange(len(e))
+        instants = e.instants(record.sampling_time)
         names = tuple(c.name for c in (*record.inputs, *record.outputs))
         values = np.hstack([e.inputs, e.outputs])
-        runs.append((Run(values, instants, names, len(record.inputs), record.sampling_time), e))
+        step, even = record.sampling_time, e.steps is None
+        run = Run(values, instants, names, len(record.inputs), step, even=even)
+        runs.append((run, e))
     experiments, step, done, lost = prepared_experiments(runs, steps)
     changed = replace(
         record, experiments=experiments, sampling_time=step, missing=record.missing + lost

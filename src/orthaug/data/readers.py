@@ -27,6 +27,7 @@ from orthaug.data.record import (
     as_channels,
     check_step,
     same_step,
+    steps_between,
     unbroken,
 )
 from orthaug.data.steps import Fill, Outliers, Resample, Run
@@ -34,6 +35,8 @@ from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
+# Times the usual step: what the inputs did in a longer one is not known
+GAP = 10.0
 _LATEST = 1e11  # s; later than the year 5000
 # How files write a sample that is not there
 _MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")
@@ -52,6 +55,7 @@ def read_record(
     missing: str = "error",
     experiment: str | None = None,
     prepare: Sequence[Any] = (),
+    uneven: bool = False,
 ) -> Record:
     r"""Read one file; several row ranges are experiments of their own.
 
@@ -73,6 +77,8 @@ def read_record(
         experiment: the column, of numbers, that labels the experiments; each is in one piece.
         prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples
             are looked at; with `Resample()` the instants of `time` may be uneven.
+        uneven: take instants of `time` that are uneven as they are. Equations of motion step from
+            each to the next; all else needs even instants.
 
     Raises:
         InputError: no such file, wrong type, missing columns, cells that are empty or no finite
@@ -104,7 +110,7 @@ def read_record(
     if missing == "keep":
         needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]
     total = len(next(iter(table.columns.values())))
-    experiments, steps, recorded = [], [], 0
+    experiments, steps, recorded, is_uneven = [], [], 0, False
     ranges = _ranges(rows, total, path)
     ranges = ranges if experiment is None else _split_by_label(table, experiment, ranges)
     if prepare:
@@ -133,7 +139,16 @@ def read_record(
             place = (str(path), start, every, table.first_line, began, offset)
             experiments.append(Experiment(signals[0], signals[1], *place))
             if time and (stop - start > 1 or missing == "error"):
-                steps.append(_uniform_step(table, time, start, stop))
+                try:
+                    steps.append(_uniform_step(table, time, start, stop))
+                except InputError:
+                    if not uneven:
+                        raise
+                    _check_rising(table, time, start, stop)
+                    is_uneven = True
+    if time and is_uneven:
+        record = Record(*map(tuple, channels), 1.0, tuple(experiments), time)  # type: ignore[arg-type]
+        return _with_instants(record, table.columns[time], recorded)
     if time and not steps:
         raise InputError(
             f"{path}: no two rows without missing cells follow each other; the sampling time "
@@ -414,6 +429,37 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             )
 
 
+def _check_rising(table: Table, time: str, start: int, stop: int) -> None:
+    """Raise InputError for instants that do not rise, or with a gap between them."""
+    steps = np.diff(table.columns[time][start:stop])
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    for bad, what in (
+        (steps <= 0, "expected rising instants."),
+        (
+            steps > GAP * usual,
+            "what the inputs did meanwhile is not known. Give row ranges on either side of it.",
+        ),
+    ):
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                f"{table.path}: {table.where(start + row + 1)}, column '{time}': a step of "
+                f"{steps[row]:g} s where {usual:g} s is usual; {what}"
+            )
+
+
+def _with_instants(record: Record, instants: Vector, recorded: int) -> Record:
+    """Return the record with the steps between its rows; stretches of one row are left out."""
+    found = []
+    for one in record.experiments:
+        rows = slice(one.first_row, one.first_row + one.stride * len(one), one.stride)
+        if len(one) > 1:
+            found.append(replace(one, steps=steps_between(instants[rows])[1]))
+    mean = float(np.mean(np.concatenate([one.steps[:-1] for one in found])))
+    missing = recorded - sum(map(len, found))
+    return replace(record, experiments=tuple(found), sampling_time=mean, missing=missing)
+
+
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     """Return the mean step of the time column, checked to be even.
 
@@ -427,7 +473,10 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     steps = np.diff(instants)
     mean, usual = float(steps.mean()), float(np.sort(steps)[(len(steps) - 1) // 2])
     odd = np.flatnonzero(np.abs(steps - usual) > JITTER * usual) if usual > 0 else np.array([0])
-    remedy = "expected evenly sampled, rising time. Resample, or take row ranges without gaps."
+    remedy = (
+        'expected evenly sampled, rising time. Resample (`[[data.prepare]] step = "resample"`), '
+        "or take row ranges without gaps."
+    )
     if odd.size:
         row = start + int(odd[0]) + 1
         raise InputError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import (
     Matrix,
+    Vector,
     as_signal,
     check_choice,
     check_label,
@@ -23,6 +24,10 @@ from orthaug.data.expressions import RESERVED, is_name
 from orthaug.data.prepared import Preparation, added_up
 
 LONGEST_STEP = 1e12  # s; a longer one overflows somewhere in a time axis
+UNEVEN = (
+    "needs even instants, and those of this record are uneven. Resample it: "
+    '`[[data.prepare]] step = "resample"`, from Python `oa.prepare(record, oa.Resample())`.'
+)
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
 
 
@@ -36,6 +41,23 @@ def unbroken(values: Matrix) -> list[tuple[int, int]]:
     there = np.isfinite(values).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def instants_of(count: int, sampling_time: float, steps: Vector | None) -> Vector:
+    """Return the instants (count,) of rows in s, the first of them 0.
+
+    Args:
+        steps: from each row to the next, where they are uneven.
+    """
+    if steps is None:
+        return sampling_time * np.arange(count)
+    return np.concatenate([[0.0], np.cumsum(steps[:-1])])
+
+
+def steps_between(instants: Vector) -> tuple[float, Vector]:
+    """Return the mean step, and the step from each instant to the next, the last one repeated."""
+    steps = np.diff(instants)
+    return float(steps.mean()), np.append(steps, steps[-1])
 
 
 @dataclass(frozen=True)
@@ -137,7 +159,9 @@ class Experiment:
 
     Messages say where a row came from: `source`, `first_row`, `stride` and `first_line`, the file's
     line of its row 0. `start_time` [s] is the instant of the first row. A stretch between missing
-    samples is a part of a recording, and begins `offset` rows into it.
+    samples is a part of a recording, and begins `offset` rows into it. `steps` (N,) are the seconds
+    from each row to the next where the instants are uneven, the last of them repeated; None where
+    they are `sampling_time` apart.
     """
 
     inputs: Matrix
@@ -148,6 +172,7 @@ class Experiment:
     first_line: int | None = None
     start_time: float = 0.0
     offset: int = 0
+    steps: Vector | None = None
 
     def __len__(self) -> int:
         return len(self.inputs)
@@ -166,6 +191,16 @@ class Experiment:
                 f"{found[0]} and {found[1]}; expected (rows, {inputs}) and (rows, {outputs}), "
                 "one column for each channel."
             )
+        steps = self.steps
+        if steps is not None and not (np.shape(steps) == (len(self),) and np.all(steps > 0)):
+            raise InputError(
+                f"{self.source or 'an experiment'}: `steps` must be positive seconds to the next "
+                f"row, one for each of the {len(self)} rows."
+            )
+
+    def instants(self, sampling_time: float) -> Vector:
+        """Return the instants (N,) of the rows in s, from `start_time` on."""
+        return self.start_time + instants_of(len(self), sampling_time, self.steps)
 
     def where(self, row: int) -> str:
         """Return the place of a row: `run.csv: line 17 (row 15)`, as much of it as is known."""
@@ -178,9 +213,9 @@ class Experiment:
     def rows(self, start: int | None, stop: int | None) -> Experiment:
         """Return the half-open range of rows `[start, stop)` as an experiment of its own."""
         first = self.first_row + self.stride * range(len(self))[start:stop].start
-        return replace(
-            self, inputs=self.inputs[start:stop], outputs=self.outputs[start:stop], first_row=first
-        )
+        steps = None if self.steps is None else self.steps[start:stop]
+        inputs, outputs = self.inputs[start:stop], self.outputs[start:stop]
+        return replace(self, inputs=inputs, outputs=outputs, first_row=first, steps=steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +275,7 @@ class Record(NotebookView):
         outputs: Sequence[str | Channel] | None = None,
         source: str = "",
         missing: str = "error",
+        time: Any = None,
     ) -> Record:
         """Return one experiment from arrays.
 
@@ -250,6 +286,8 @@ class Record(NotebookView):
             inputs, outputs: names (or `Channel`s with units); default `u`, `y`, or `u1, u2, …`.
             source: where it came from, for messages.
             missing: "error", or "keep" where outputs may be NaN for an `Observer`.
+            time: instants (N,) in s that rise unevenly, instead of `sampling_time`, which is then
+                their mean step. Equations of motion step from each to the next.
 
         Raises:
             InputError: lengths that differ, cells that are not finite, names that do not fit.
@@ -272,11 +310,22 @@ class Record(NotebookView):
                 f"`y` has {len(y_signal)} rows but `u` has {len(u_signal)}. "
                 "Give both the same length, or drop the last rows."
             )
+        one = Experiment(u_signal, y_signal, source)
+        if time is not None:
+            if sampling_time != 1.0:
+                raise InputError("give `sampling_time` or `time`, not both.")
+            instants = as_signal(time, "time")[:, 0]
+            if len(instants) != rows or rows < 2 or not (np.diff(instants) > 0).all():
+                raise InputError(
+                    f"`time` must be {max(rows, 2)} rising instants in s, one for each row."
+                )
+            sampling_time, steps = steps_between(instants)
+            one = replace(one, start_time=float(instants[0]), steps=steps)
         return cls(
             _channels(inputs, "u", u_signal.shape[1]),
             _channels(outputs, "y", y_signal.shape[1]),
             sampling_time,
-            (Experiment(u_signal, y_signal, source),),
+            (one,),
         )
 
     @classmethod
@@ -293,12 +342,17 @@ class Record(NotebookView):
                 raise InputError(
                     f"records with other channels cannot be joined: {first!r} and {other!r}."
                 )
-            if not same_step(other.sampling_time, first.sampling_time):
+            even = other.even and first.even
+            if even and not same_step(other.sampling_time, first.sampling_time):
                 raise InputError(
                     f"{other.experiments[0].source or 'a record'}: sampled every "
                     f"{other.sampling_time:g} s, {first.experiments[0].source or 'another'} "
                     f"every {first.sampling_time:g} s; resample one of them."
                 )
+        if not all(record.even for record in records):
+            records = tuple(record.with_steps() for record in records)
+            steps = [e.steps for record in records for e in record.experiments]
+            first = replace(first, sampling_time=float(np.mean(np.concatenate(steps))))  # type: ignore[arg-type]
         experiments = tuple(e for record in records for e in record.experiments)
         missing = sum(record.missing for record in records)
         return replace(
@@ -340,10 +394,36 @@ class Record(NotebookView):
             for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
         )
         plural = "s" if count != 1 else ""
+        uneven = "" if self.even else " on average, uneven"
         return (
             f"Record({count} experiment{plural}, {len(self)} samples, Ts = "
-            f"{self.sampling_time:g} s, {names})"
+            f"{self.sampling_time:g} s{uneven}, {names})"
         )
+
+    @property
+    def even(self) -> bool:
+        """Whether the rows of all experiments are `sampling_time` apart."""
+        return all(experiment.steps is None for experiment in self.experiments)
+
+    @property
+    def longest_step(self) -> float:
+        """The longest time between two rows in s."""
+        steps = [e.steps[:-1].max() for e in self.experiments if e.steps is not None and len(e) > 1]
+        return max(map(float, steps), default=self.sampling_time)
+
+    def with_steps(self) -> Record:
+        """Return the record with the step of every row, of even instants too."""
+        step = self.sampling_time
+        filled = (
+            e if e.steps is not None else replace(e, steps=np.full(len(e), step))
+            for e in self.experiments
+        )
+        return replace(self, experiments=tuple(filled))
+
+    def check_even(self, what: str) -> None:
+        """Raise InputError where the instants are uneven, which `what` cannot take."""
+        if not self.even:
+            raise InputError(f"{what} {UNEVEN}")
 
     @property
     def recordings(self) -> tuple[int, ...]:
@@ -443,7 +523,9 @@ class Record(NotebookView):
         first = range(len(experiment))[start:stop].start
         return replace(
             experiment.rows(start, stop),
-            start_time=experiment.start_time + first * self.sampling_time,
+            start_time=float(experiment.instants(self.sampling_time)[first])
+            if first < len(experiment)
+            else experiment.start_time,
         )
 
 

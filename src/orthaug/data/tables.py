@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, nearest
-from orthaug._base.errors import InputError, MissingColumnError
+from orthaug._base.errors import InputError, MissingColumnError, MissingFileError
 from orthaug._base.memory import check_memory
 from orthaug._base.progress import LOG
 from orthaug.data.headers import in_seconds, parse_dates
@@ -145,7 +145,7 @@ def check_readable(path: Path) -> None:
     """Raise InputError unless `path` is a file with something in it."""
     try:
         if not path.exists():
-            raise InputError(f"{path}: no such file.")
+            raise MissingFileError(f"{path}: no such file.")
         if not path.is_file():
             raise InputError(f"{path}: not a file.")
         with path.open("rb") as file:
@@ -155,7 +155,7 @@ def check_readable(path: Path) -> None:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
     except ValueError:
-        raise InputError(f"{path}: no such file.") from None
+        raise MissingFileError(f"{path}: no such file.") from None
     if empty:
         raise InputError(f"{path}: the file is empty (0 bytes).")
 

@@ -19,6 +19,7 @@ from orthaug._base.checks import check_type, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug._base.jax import jax
+from orthaug.export import written_back
 from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
 from orthaug.export.program import WRITTEN, Program, Signal, Vectors
@@ -53,9 +54,10 @@ def check_target(to: str) -> str:
     Raises:
         InputError: none of that name; the nearest is named.
     """
-    if not isinstance(to, str) or to not in TARGETS:
-        hint = nearest(to, TARGETS) if isinstance(to, str) else ""
-        raise InputError(f"no export to {show(to)}{hint}; known are {', '.join(TARGETS)}.")
+    known = (*TARGETS, *written_back.targets())
+    if not isinstance(to, str) or to not in known:
+        hint = nearest(to, known) if isinstance(to, str) else ""
+        raise InputError(f"no export to {show(to)}{hint}; known are {', '.join(known)}.")
     return to
 
 
@@ -83,13 +85,15 @@ def export(
     *,
     name: str = "model",
     force: bool = False,
-) -> Program:
+) -> Program | None:
     """Write a model as code that needs no orthaug, and return the program that was written.
+
+    Targets of a source, such as fmu-parameters, write estimates, and no program.
 
     Args:
         model: what to write.
         folder: a new one, or one that holds an export.
-        to: c, casadi, control, fmu, numpy, onnx or latex.
+        to: c, casadi, control, fmu, numpy, onnx or latex; of a source fmu-parameters or mjcf.
         name: is put in front of the functions in C, and names the files.
         force: replace the folder whatever it holds.
 
@@ -113,8 +117,13 @@ def export(
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
     check_export(to, folder, name, force=force)
+    if to not in TARGETS:
+        written_back.write_back(model, folder, to, force=force)
+        return None
     target: Target = TARGETS[to]()
-    program = program_of(model, name, storage.digest(model))
+    digest, in_loop = storage.digest(model), model.plant is not model
+    model = model.plant
+    program = program_of(model, name, digest)
     if program.scheme is not None and program.scheme.kind not in WRITTEN:
         raise InputError(
             f"the integrator '{program.scheme.kind}' cannot be written as code; known are "
@@ -124,7 +133,7 @@ def export(
     files = dict(target.files(program, vectors))
     files |= {
         VECTORS: vectors.csv(program),
-        "README.md": _readme(program, target, len(vectors.outputs)),
+        "README.md": _readme(program, target, len(vectors.outputs), in_loop=in_loop),
     }
     with whole_folder(folder, force=force) as partial:
         for file, content in files.items():
@@ -134,7 +143,7 @@ def export(
     return program
 
 
-def _readme(program: Program, target: Target, rows: int) -> str:
+def _readme(program: Program, target: Target, rows: int, *, in_loop: bool) -> str:
     state = "What the state holds at a sample k:" if program.scheme is None else "The state:"
     hold = ""
     if program.scheme is not None and program.scheme.kind != "discrete" and program.inputs:
@@ -144,6 +153,8 @@ def _readme(program: Program, target: Target, rows: int) -> str:
                 "\nInputs run straight from one sample to the next, so that a step takes those "
                 "of the next sample too. It can be made when the next inputs are known.\n"
             )
+    if in_loop:
+        hold += "\nIt is the plant: the controller that it was fitted with is no part of it.\n"
     prepared = _of_prepared(program)
     return f"""# {program.name}
 

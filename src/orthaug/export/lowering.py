@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from orthaug.models.model import Model
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
+from orthaug.physics.sources import FileSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +104,14 @@ _OWN_FUNCTION = (
 
 
 def program_of(model: Model, name: str = "model", digest: str = "") -> Program:
-    """Return the step of a model in the intermediate form.
+    """Return the step of a model in the intermediate form, that of the plant of a loop.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
             the whole record.
     """
     check_type(model, Model, "model", "a fitted model")
+    model = model.plant
     numbers = model.numbers
     if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
         raise InputError("the model holds numbers that are not finite; fit it again.")
@@ -278,6 +281,12 @@ def _split_parameters(model: Model[MotionDynamics], constants: _Constants) -> di
 
 def _motion(model: Model[MotionDynamics], name: str, digest: str) -> Program:
     form, numbers, motion = model.form, model.numbers, model.form.motion
+    if isinstance(motion.source, FileSource):
+        own = motion.source
+        raise InputError(
+            f"the motion is read from {Path(own.file).name}, which has no code here; `--to "
+            f"{own.target}` writes its parameters."
+        )
     if motion.functions is not None:
         raise InputError(f"the motion {_OWN_FUNCTION}.")
     constants = _Constants()

@@ -149,7 +149,7 @@ def numpy_step(model: Model) -> NumpyStep:
     It is for places where JAX is too slow to call.
 
     Args:
-        model: as `estimate` or `load` gives it.
+        model: as `estimate` or `load` gives it; of one in a loop the plant is taken.
 
     Returns:
         The step: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs`

@@ -1,10 +1,10 @@
-from .conclusion import orthogonalize as orthogonalize
 from .criteria import Auto as Auto
 from .criteria import Prediction as Prediction
 from .criteria import Simulation as Simulation
 from .estimates import Estimate as Estimate
 from .estimation import estimate as estimate
-from .motion_estimates import MotionEstimate as MotionEstimate
+from .motion_estimate import MotionEstimate as MotionEstimate
+from .orthogonalization import orthogonalize as orthogonalize
 from .recursive import Recursive as Recursive
 from .solvers import LevenbergMarquardt as LevenbergMarquardt
 from .status import Status as Status

@@ -58,6 +58,11 @@ class FreeRunScores:
     share: float = 1.0
 
     @property
+    def followed(self) -> Float[np.ndarray, "k m n0 n"] | None:
+        """How the best states follow the unknowns of the fit, less its sign."""
+        return self.slope
+
+    @property
     def longest(self) -> int:
         """Scored steps of the longest segment."""
         return int(np.asarray(self.segments.scored).sum(axis=1).max())

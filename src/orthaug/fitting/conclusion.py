@@ -5,24 +5,25 @@ The task's engine makes every sum over rows; no array of N rows is kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.errors import Warning
+from orthaug._base.errors import InputError, Warning
+from orthaug._base.jax import jax, jnp
 from orthaug.data.record import Record
-from orthaug.data.regressors import Features, Lags
+from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.elimination import Fixed, ThetaSplit, directions, eliminate, split_theta
-from orthaug.fitting.estimates import NOT_UNIQUE, Estimate
+from orthaug.fitting.lagged_estimate import NOT_UNIQUE, LaggedEstimate
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
-from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.silence import learner_silent
+from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.silence import is_silenced, learner_silent
 from orthaug.fitting.status import ALONE, Ending, Status
-from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training_rows import Share
+from orthaug.fitting.structures import Structure
+from orthaug.fitting.training_rows import Share, TrainingRows
 from orthaug.fitting.unfinished import (
     NOT_CONVERGED,
     ending_in_words,
@@ -33,15 +34,18 @@ from orthaug.fitting.unfinished import (
 )
 from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, theta_covariance
 from orthaug.inference.nearly_shared import enlarge_covariance
+from orthaug.inference.splitting import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
-from orthaug.models.learners import Bound, External, Function, Scaling
-from orthaug.models.model import Model
+from orthaug.models.learners import Scaling
+from orthaug.models.model import Model, TrainedSegments
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import JointCovariance, Statistics
 from orthaug.physics import ill_conditioned
-from orthaug.physics.baseline import Baseline
-from orthaug.physics.problem import Problem, pose
+from orthaug.physics.innovations import InnovationsModel
+from orthaug.physics.problem import MotionProblem, Problem, pose_motion
 
 _UNDETERMINED = (
     "no standard errors: together with the learner's weights, the data do not determine θ to "
@@ -49,7 +53,7 @@ _UNDETERMINED = (
 )
 
 
-def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -> Estimate:
+def conclude(task: TrainingRows, structure: Structure, learned: TrainedLearner) -> LaggedEstimate:
     """Solve θ, split it from the learner, and attach statistics.
 
     Args:
@@ -93,18 +97,13 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         and np.isnan(np.diag(errors.covariance)).sum() > len(fixed)
     ):
         warnings.append(Warning("no_standard_errors", _UNDETERMINED))
-    reason = ALONE.get(ending, "") if not learns else ""
-    reason = reason or ending_in_words(ending, learned.tail)
     model = _model(problem, structure, learned, ThetaSplit(theta, theta_aux, fixed), errors, noise)
     partly = learns and structure.projects and structure.shared != "all"
     shared = problem.shared if partly and problem.features.entries else None
-    return Estimate(
+    return LaggedEstimate(
         model=model,
-        status=Status(
-            ending, learned.iterations, learned.seconds, errors.mean_square, reason=reason
-        ),
+        status=_status(learned, ending, errors, physics=not learns),
         restarts=(),
-        excitation=problem.excitation,
         covariance=enlarge_covariance(errors.covariance, model.statistics, shared)
         if known
         else None,
@@ -112,7 +111,6 @@ def conclude(task: OneStepTask, structure: Structure, learned: TrainedLearner) -
         effective_weights=learned.effective,
         defect=_defect(task, structure, share, ThetaSplit(theta, theta_aux, fixed), learned),
         problem=problem,
-        criterion=task.criterion,
         at_bound={problem.baseline.names[i]: value for i, value in fixed.items()},
         warnings=tuple(warnings),
         scores=learned.scores,
@@ -127,7 +125,7 @@ def _model(
     errors: ErrorStatistics,
     noise: Matrix | None,
 ) -> Model:
-    record, scaling = problem.record, learned.scaling
+    scaling = learned.scaling
     numbers = (
         parameters.theta,
         parameters.theta_aux,
@@ -143,9 +141,47 @@ def _model(
         problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound
     )
     limits, pull = _limits(problem, form)
+    gram = None if learned.gram is None else _fix_entries(held, learned.gram)
+    return replace(
+        _model_of(
+            problem,
+            structure,
+            replace(learned, gram=gram),
+            errors._replace(noise=noise),
+            form,
+            Numbers(*numbers, learned.tilt, limits=limits, pull=pull),
+            middle=None if middle is None else _fix_entries(held, middle),
+        ),
+        shared=directions(structure, problem, parameters.fixed),
+        noise=None if problem.noise is None else problem.noise.noise,
+    )
+
+
+def _status(
+    learned: TrainedLearner, ending: Ending, errors: ErrorStatistics, *, physics: bool
+) -> Status:
+    """Return the status of a run; `physics` for one without a learner, or that needs one."""
+    reason = ALONE.get(ending, "") if physics else ""
+    reason = reason or ending_in_words(ending, learned.tail)
+    spent = (learned.iterations, learned.seconds)
+    return Status(ending, *spent, errors.mean_square, reason=reason)
+
+
+def _model_of(
+    problem: Problem | MotionProblem,
+    structure: Structure,
+    learned: TrainedLearner,
+    errors: ErrorStatistics,
+    form: Any,
+    numbers: Numbers,
+    *,
+    middle: Matrix | None,
+) -> Model[Any]:
+    """Return the model of a problem's record, with the statistics of its errors."""
+    record = problem.record
     return Model(
         form=form,
-        numbers=Numbers(*numbers, learned.tilt, limits=limits, pull=pull),
+        numbers=numbers,
         outputs=record.outputs,
         inputs=record.inputs,
         sampling_time=record.sampling_time,
@@ -155,15 +191,13 @@ def _model(
         largest_output=problem.largest_output,
         deviation=problem.deviation,
         weight=problem.weight.matrix,
-        shared=directions(structure, problem, parameters.fixed),
-        noise=None if problem.noise is None else problem.noise.noise,
         statistics=Statistics(
-            None if learned.gram is None else _fix_entries(held, learned.gram),
-            None if middle is None else _fix_entries(held, middle),
-            noise,
+            learned.gram,
+            middle,
+            errors.noise,
             learned.ridge,
             errors.freedom,
-            learned.errors is not None,
+            simulated=learned.errors is not None,
         ),
     )
 
@@ -182,7 +216,7 @@ def _limits(problem: Problem, form: LaggedDynamics) -> tuple[Matrix | None, Matr
 
 
 def _one_step_errors(
-    task: OneStepTask, structure: Structure, learned: TrainedLearner, c: Vector, fixed: Fixed
+    task: TrainingRows, structure: Structure, learned: TrainedLearner, c: Vector, fixed: Fixed
 ) -> ErrorStatistics:
     """Return the statistics of the one-step residual."""
     problem, ny = task.problem, len(task.problem.outputs)
@@ -250,7 +284,7 @@ def _middle(problem: Problem, learned: TrainedLearner, noise: Matrix | None) -> 
 
 
 def _defect(
-    task: OneStepTask,
+    task: TrainingRows,
     structure: Structure,
     share: Share,
     parameters: ThetaSplit,
@@ -332,39 +366,222 @@ def _warnings(
     return warnings
 
 
-def orthogonalize(
-    record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
-) -> Estimate:
-    """Split a model trained elsewhere into physics and an orthogonal rest (F2).
+_WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
+_TRIED_ROWS = 1000  # on which windows are compared
+
+
+def conclude_motion(
+    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner, alone: Vector | None
+) -> MotionEstimate:
+    """Split the fitted motion and attach statistics.
 
     Args:
-        record: the rows over which the rest is made orthogonal, usually the training data.
-        baseline: the physics.
-        function: `g(x)` on NumPy regressors (N, nx) in `Lags` order, giving (N, ny); from any
-            toolbox.
-        lags: the regressor that `function` expects; None for the raw lags of the baseline.
-
-    Returns:
-        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g −
-        φθ`. There are no standard errors: they belong to how `function` was trained.
+        plan: the segments that were trained on.
+        learned: of these segments.
+        alone: coordinates of physics alone; None where no run of it is finite.
     """
-    problem = pose(record, baseline, lags)
-    ny, nz = len(problem.outputs), len(problem.features.entries)
-    external = External(function, ny=ny)
-    values = external.values(problem.feature_rows())  # once; the sums below read what it gave
-    scaling, unit = Scaling(np.zeros(nz), np.ones(nz)), np.ones(ny)
-    task = OneStepTask.of(replace(problem, features=Features(())), None)
-    gain = np.broadcast_to(problem.weight.matrix / task.rms, (*values.shape, ny))
-    rows = task.engine.build_rows(
-        values, problem.projection.q, problem.unexplained / task.rms, gain
+    problem, begins = plan.problem, alone is not None
+    assert learned.coefficients is not None and learned.errors is not None
+    states = plan.segments.start if learned.scores is None else learned.scores.states
+    slope = None if learned.scores is None else learned.scores.followed
+    unsettled = (not_converged(learned),) if is_unfinished(learned) else ()
+    learned = withheld(learned) if unsettled else learned
+    errors = learned.errors
+    assert errors is not None and learned.coefficients is not None
+    alone = np.asarray(learned.coefficients if alone is None else alone)
+    layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
+    trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
+    model = replace(_motion_model(plan, structure, learned), trained=trained)
+    status = _status(learned, learned.ending, errors, physics=not (learned.bound.learns and begins))
+    if status.reason and not (learned.ending.usable or learned.bound.learns and begins):
+        if where := problem.without_value(np.any):
+            status = replace(status, reason=f"{where}; correct it, or bound its parameters")
+        elif problem.grows:
+            grows = f"physics alone has no finite free run: {problem.grows}"
+            status = replace(status, reason=grows)
+    silent = learner_silent(learned, _learner_values(plan, learned))
+    fit = MotionEstimate(
+        model=model,
+        status=status,
+        restarts=(),
+        covariance=None,
+        freedom=errors.freedom,
+        effective_weights=learned.effective,
+        defect=None,
+        problem=problem,
+        criterion=plan.criterion,
+        split_by=MotionSplit.empty("training", plan.dynamics, learned.coefficients),
+        segmented=plan,
+        states=states,
+        slope=slope,
+        alone=alone,
+        scores=learned.scores,
+        warnings=(*without_loss(errors.mean_square), *unsettled, *silent),
     )
-    task = replace(task, problem=problem, rows=rows, unit=unit, bound=Bound(_GIVEN, ny, ny))
-    concluded = conclude(
-        task, Orthogonal(), TrainedLearner(task.bound, np.zeros(0), scaling, unit, elsewhere=True)
+    return (
+        fit.split(structure.measure, getattr(structure, "shared", "auto"))
+        if learned.ending.usable
+        else fit
     )
-    form = replace(concluded.model.form, bound=Bound(external, nz, ny))
-    return replace(concluded, model=replace(concluded.model, form=form))
 
 
-_GIVEN = Function(lambda w, z: z, lambda key: (), beyond="free")
-"""The learner whose values are its features."""
+def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:
+    """Return the values (N, nl) of a nearly silent learner along the training runs.
+
+    None of others.
+    """
+    bound = plan.bound
+    if learned.scores is None or not is_silenced(learned.effective, bound.ny):
+        return None
+    assert learned.coefficients is not None
+    x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
+    with np.errstate(all="ignore"):
+        features = plan.scaling(np.asarray(plan.dynamics.seen(x.T, u.T, np)).T)
+    values = np.asarray(jax.vmap(lambda z: bound.values(jnp.asarray(learned.weights), z))(features))
+    return values if np.isfinite(values).all() else None
+
+
+def _motion_model(
+    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner
+) -> Model[MotionDynamics]:
+    assert learned.coefficients is not None and learned.errors is not None
+    noise = learned.errors.noise
+    middle = None
+    if noise is not None and learned.gram is not None and learned.middle is not None:
+        middle = learned.middle(plan.problem.weight.whitened(noise))
+    made = (plan.dynamics.plain, plan.numbers(learned.coefficients, learned.weights))
+    model = replace(
+        _model_of(plan.problem, structure, learned, learned.errors, *made, middle=middle),
+        weight=plan.weight,
+        noise=plan.predictor,
+        starts=EstimatedStates(_WINDOWS[0] * (plan.dynamics.states + 1), plan.loose),
+    )
+    if not learned.ending.usable:
+        return model
+    if plan.predictor is None:  # a predictor forgets where it began
+        model = _with_window(model, _best_window(model, plan.record))
+    return (
+        model
+        if not model.learns
+        else _with_limits(replace(model, seen=_feature_range(model, plan.record)), plan.record)
+    )
+
+
+def _with_limits(model: Model[MotionDynamics], record: Record) -> Model[MotionDynamics]:
+    """Return the model with the range of its features over the fitted run.
+
+    Beyond that range the correction stays constant or fades.
+    """
+    limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
+    if limits is None:
+        return model
+    nx = model.form.states
+
+    def features(points: Matrix) -> Matrix:
+        return model.form.features_at(points[:, :nx], points[:, nx:])
+
+    pull = pull_of(features, model.reach(record))
+    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
+
+
+def _feature_range(model: Model[MotionDynamics], record: Record) -> Matrix | None:
+    """Return the least and largest (2, nz) of the learner's features over the free run.
+
+    None where it has no finite ones.
+    """
+    states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
+    with np.errstate(all="ignore"):
+        features = model.form.features_at(states, inputs)
+    finite = features[np.isfinite(features).all(axis=1)]
+    return np.stack([finite.min(axis=0), finite.max(axis=0)]) if finite.size else None
+
+
+def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynamics]:
+    """Return the model with another number of rows that give a state to predict from."""
+    assert isinstance(model.starts, EstimatedStates)
+    return replace(model, starts=replace(model.starts, window=window))
+
+
+def _best_window(model: Model[MotionDynamics], record: Record) -> int:
+    """Return the window of rows that predicts one step ahead best.
+
+    On some of the training data.
+    """
+    longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
+    tried = [n * (model.form.states + 1) for n in _WINDOWS]
+    best, least = tried[0], np.inf
+    for window in tried:
+        if best != window and 4 * window > len(longest):
+            break
+        part = replace(record, experiments=(longest,))
+        try:
+            response = _with_window(model, window).predict(part)
+        except InputError:  # not even one window fits
+            break
+        (trajectory,) = response.trajectories
+        assert trajectory.measured is not None
+        with np.errstate(all="ignore"):
+            errors = (trajectory.model - trajectory.measured)[
+                tried[-1] if len(longest) > 4 * tried[-1] else window :
+            ]
+            square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
+        if square < 0.98 * least:  # a longer one only where it is clearly better
+            best, least = window, square
+    return best
+
+
+def _kept_gain(model: Model[MotionDynamics]) -> InnovationsModel | None:
+    """Return the noise model of a model that was trained as a predictor; None of others."""
+    noise = model.noise
+    return noise if isinstance(noise, InnovationsModel) and not noise.white else None
+
+
+def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstimate:
+    """Return the estimate of a saved model with its training data, to split again.
+
+    It lacks the results of its training.
+
+    Raises:
+        InputError: other data than the model was trained on.
+    """
+    kept, form, numbers = model.trained, model.form, model.numbers
+    if kept is None:
+        raise InputError(
+            "the model was saved without the statistics that a split needs; fit it again."
+        )
+    record = model.fitting(record, need_outputs=True)
+    problem = pose_motion(record, form.motion, [entry.text for entry in form.features] or None)
+    problem = replace(problem, weight=replace(problem.weight, matrix=model.weight))
+    criterion = Simulation(kept.segment, kept.washout)
+    segmented = SegmentedMotion.of(problem, form.bound, criterion, predictor=_kept_gain(model))
+    segmented = segmented.with_substeps(form.substeps)
+    segmented = replace(
+        segmented,
+        scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
+        unit=np.asarray(numbers.gain),
+    )
+    if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(
+        kept.states
+    ):
+        raise InputError(
+            f"the model was trained on other rows: {kept.rows} instead of "
+            f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
+            "its training."
+        )
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    return MotionEstimate(
+        model=model,
+        status=Status(Ending.EXACT, 0, 0.0, np.nan),
+        restarts=(),
+        covariance=None,
+        freedom=model.statistics.freedom,
+        effective_weights=np.nan,
+        defect=None,
+        problem=problem,
+        criterion=criterion,
+        split_by=MotionSplit.empty(model.measure, form, c),
+        segmented=segmented,
+        states=kept.states,
+        slope=kept.slope,
+        alone=np.asarray(kept.alone),
+    )

@@ -1,79 +1,110 @@
-"""The result of an estimation: parameters with intervals, status, model."""
+"""`Estimate`, the result of an estimation of any physics: values, errors, tables, text.
+
+What θ is under a measure, and how it follows the fitted numbers, depends on the physics:
+`lagged_estimate`, where it is linear in θ, and `motion_estimate`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector, check_choice, check_count, check_type
+from orthaug._base.checks import Matrix, Vector, check_choice, check_count
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import INTERVAL_HEAD, estimate_rows, fold, table
+from orthaug._base.views import FitView
 from orthaug.data.record import Record
-from orthaug.fitting.any_fit import (
-    STD_KINDS,
-    WITHHELD,
-    AnyFit,
-    Restart,
-    left_out,
-    parameter_lines,
-)
+from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.fitting.criteria import Criterion, Prediction, Simulation
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.output_noise import OutputNoise, noise_of
+from orthaug.fitting.setup import TrainingSetup
 from orthaug.fitting.status import Status
-from orthaug.inference.covariance import (
-    joint_covariance,
-    robust_covariance,
-    robust_split_covariance,
-    row_influence,
-)
-from orthaug.inference.influence import hc3, one_step_slopes
-from orthaug.inference.learned_terms import learned_terms, term_lines
-from orthaug.inference.measures import (
-    OF_ROWS,
-    Measure,
-    Points,
-    Support,
-    Training,
-    weigh_problem,
-)
-from orthaug.inference.nearly_shared import enlarge_covariance
-from orthaug.inference.over_experiments import (
-    split_without_each,
-)
-from orthaug.inference.physical import PhysicalEstimate, profile, solve
-from orthaug.inference.splitting import (
-    MeasureSplit,
-    learner_slope,
-    split_by_measure,
-    streamed_slope,
-)
+from orthaug.inference.covariance import interval
+from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
+from orthaug.inference.measures import Measure
+from orthaug.inference.over_experiments import FEWEST, OverExperiments, over_experiments
 from orthaug.models.model import Model
-from orthaug.models.statistics import Statistics
-from orthaug.physics.baseline import check_sampling_constant
+from orthaug.models.response import Response
+from orthaug.models.statistics import Statistics, half_inverse
 from orthaug.physics.excitation import Excitation
-from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.problem import Problem
-from orthaug.physics.streamed import StreamedProblem
+from orthaug.physics.parameters import Coordinates
 
-NOT_UNIQUE = "theta_not_unique"
-"""The code of the warning that a split under a measure makes untrue."""
+if TYPE_CHECKING:
+    import pandas as pd
+
+STD_KINDS = {
+    "plain": "for white errors of constant variance",
+    "hc3": "robust (HC3), because the variance of the errors is not constant",
+    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
+    "batch-means": "robust (batch means), because the errors of the free run are coloured",
+    "autoregressive": (
+        "robust (autoregressive errors), because the errors of the free run are coloured"
+    ),
+    "batch-means-uneven": (
+        "robust (batch means), because the variance of the free run's errors is not constant"
+    ),
+    "none": "none: the errors of the free run are correlated over too many steps",
+    "chosen": "none: the terms were chosen on the rows that were fitted",
+}
+"""How standard errors were made, in words."""
+WITHHELD = ("none", "chosen")
+"""The kinds of fits that have none."""
+_FOR_THE_LIBRARY = {
+    *(
+        "alone",
+        "coordinates",
+        "layout",
+        "lines",
+        "moves_by",
+        "plain_statistics",
+        "reach",
+        "robust_kinds",
+    ),
+    *("scores", "segmented", "slope", "states", "withheld"),
+}
+"""Attributes of fits that completion does not list: other parts of the library read them."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Estimate(AnyFit):
+@dataclass(frozen=True)
+class Restart:
+    """One run from its own initial weights."""
+
+    seed: int
+    loss: float | None
+    iterations: int
+    code: str
+    chosen: bool
+    regularization: str | float = "none"
+    validation: float | None = None
+    """Mean squared error where nothing was fitted: on the validation record, or on held-out blocks.
+    """
+    score: float | None = None
+    """Generalised cross-validation, where that chose among the runs."""
+
+
+ROBUST_FREE_RUN = ("batch-means", "batch-means-uneven", "autoregressive")
+"""Robust standard errors of a free run, the default first."""
+
+Fit = TypeVar("Fit", bound="Estimate")
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Estimate(FitView):
     """Result of `estimate`. Print `fit.summary()`; use `fit.model`; read `fit.parameters`."""
 
-    model: Model
+    model: Model[Any]
     status: Status
     restarts: tuple[Restart, ...]
-    excitation: Excitation
     covariance: Matrix | None
-    """Cov θ̂ (nθ, nθ); None where θ has no standard error."""
+    """Cov θ̂ (nθ, nθ), of a motion that of the parameters' coordinates; NaN where one has no
+    standard error, None where none has.
+    """
     freedom: float
     """Degrees of freedom of the residual: rows less parameters less effective weights.
 
@@ -81,20 +112,18 @@ class Estimate(AnyFit):
     """
     effective_weights: float
     defect: float | None
-    """‖QᵀF̃‖ / ‖F‖ over the training rows: how much of the learner the physics could express; None
-    without one.
+    """How much of the learner the physics could express: ‖QᵀF̃‖ / ‖F‖ over the measure's points;
+    None without one.
     """
-    problem: Problem = field(repr=False)
+    problem: Any = field(repr=False)
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
-    measure: MeasureSplit | None = None
-    """What θ was split under, if not the training measure."""
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters at a bound, with its value."""
     held_out: HeldOutErrors | None = None
     """By what the run was chosen; None where the lowest training loss chose."""
     focus: Focus | None = None
     """What `Auto` chose, and why; None where the criterion was declared."""
-    physics_alone: Any = field(default=None, repr=False)
+    physics_alone: Estimate | None = field(default=None, repr=False)
     """The estimate of physics alone that the learner had to beat; None without a learner."""
     warnings: tuple[Warning, ...] = ()
     plain_covariance: Matrix | None = None
@@ -105,21 +134,51 @@ class Estimate(AnyFit):
     """How the standard errors were made, a key of `STD_KINDS`."""
     plain_statistics: Statistics | None = field(default=None, repr=False)
     """The model's statistics for white noise, where they are robust; None where they are not."""
+    setup: TrainingSetup | None = field(default=None, repr=False)
+    """Its problem as it was given and the options of training; None of a model that was split."""
 
-    def reach(self, record: Record) -> Matrix:
-        """Return the regressors (N, nx) of a record in the model's order of channels."""
-        own = record is self.problem.record
-        return self.problem.rows.x if own else self.model.reach(record)
+    def __dir__(self) -> list[str]:
+        """Return the public names, which completion lists."""
+        names = set(super().__dir__()) - _FOR_THE_LIBRARY
+        return sorted(name for name in names if not name.startswith("_"))
+
+    def predict(self, record: Record, horizon: int = 1) -> Response:
+        """Predict each row of a record some steps ahead, as `model.predict` does.
+
+        Args:
+            record: inputs and outputs, measured.
+            horizon: samples ahead, 1 or more.
+
+        Raises:
+            InputError: a record without outputs, other channels, a horizon below 1, too few rows.
+        """
+        return self.model.predict(record, horizon)
+
+    def simulate(self, record: Record, initial: str | Any = "measured") -> Response:
+        """Simulate the free run on a record, as `model.simulate` does.
+
+        Args:
+            record: inputs, and outputs where they are measured.
+            initial: "measured" (from the record), "zero", or an array (rows, ny) of the outputs
+                that determine the start.
+
+        Raises:
+            InputError: other channels, too few rows, or initial values that are not there.
+        """
+        return self.model.simulate(record, initial)
+
+    @property
+    def excitation(self) -> Excitation:
+        """Rank and condition of the parameters in what they were fitted to."""
+        raise NotImplementedError
 
     @property
     def one_step_theta(self) -> Vector | None:
         """Φ⁺Y (nθ,), the one-step least squares, where θ was trained on another criterion.
 
-        None otherwise.
+        None otherwise, and of a motion.
         """
-        if self.criterion.free_run is None:
-            return None
-        return self.problem.least_squares
+        return None
 
     @cached_property
     def noise(self) -> tuple[OutputNoise, ...]:
@@ -132,74 +191,16 @@ class Estimate(AnyFit):
         Nothing is trained again.
 
         Raises:
-            InputError: a measure that does not fit the model, or a θ at a bound.
+            InputError: a measure that does not fit the model, or a θ that cannot be split.
         """
-        check_type(measure, Measure, "measure", "a measure such as Uniform()")
-        if self.at_bound:
-            raise InputError(
-                f"{', '.join(self.at_bound)} at a bound: a split under the {measure.name} "
-                "measure has no bounds. Drop the bounds, keep the training measure, or set "
-                "`fixed = true` there."
-            )
-        support = Support(
-            self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
-        )
-        joint = self.model.statistics.joint(len(self.theta))
-        under = split_by_measure(measure, self.model, support, joint)
-        if under.covariance is not None:
-            training = self.covariance if self.measure is None else None
-            training = (
-                split_by_measure(Training(), self.model, support, joint).covariance
-                if training is None
-                else training
-            )
-            with np.errstate(all="ignore"):
-                price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
-            under = replace(under, price=price)
-        plain = None
-        if self.plain_statistics is not None and under.slope is not None:
-            plain = self._cov_along(self.plain_statistics, under.slope)
-        ensemble = under.covariance is None and self.model.numbers.tilt is not None
-        text = "no standard errors after a split: an ensemble has no gradient in its weights."
-        unknown = (Warning("no_standard_errors", text),) if ensemble else ()
-        numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
-        return replace(
-            self,
-            model=replace(
-                self.model, numbers=numbers, structure="orthogonal", measure=measure.name
-            ),
-            covariance=None if self.std_kind in WITHHELD else under.covariance,
-            plain_covariance=plain,
-            std_kind=self.std_kind if plain is not None or self.std_kind in WITHHELD else "plain",
-            defect=under.defect,
-            measure=under,
-            warnings=(
-                *(w for w in self.warnings if w.code != NOT_UNIQUE),
-                *under.warnings,
-                *unknown,
-            ),
-        )
+        raise NotImplementedError
 
-    def withheld(self, kind: str, why: Warning) -> Estimate:
-        return replace(super().withheld(kind, why), plain_statistics=None)
+    @property
+    def robust_kinds(self) -> tuple[str, ...]:
+        """Robust standard errors that there are for its criterion, the default first."""
+        return ROBUST_FREE_RUN
 
-    def joint_covariance(self, convention: str = "calibrated") -> Matrix:
-        """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.
-
-        Convention "paper" for eq:cov_approx / N.
-        """
-        if self.criterion.free_run is not None or (
-            self.model.statistics.gram is None and self.model.numbers.tilt is None
-        ):
-            raise InputError("the joint covariance needs a one-step fit with its own statistics.")
-        if self.model.coloured:
-            raise InputError(
-                "the joint covariance of θ̂ and weights is for white noise; `covariance` is that of "
-                "θ̂ with the noise model."
-            )
-        return joint_covariance(self.problem, self.model, convention)
-
-    def robust(self, lags: int | None = None, kind: str | None = None) -> Estimate:
+    def robust(self: Fit, lags: int | None = None, kind: str | None = None) -> Fit:
         """Return the fit with standard errors of θ that hold for coloured and uneven noise.
 
         One step ahead they are those of Newey and West, or HC3 for noise that is uneven and white.
@@ -210,241 +211,279 @@ class Estimate(AnyFit):
             lags: of the autocovariances; on the free run steps of a block. By default `⌊4
                 (N/100)^(2/9)⌋`, on the free run three times as many as the correlation of the
                 errors lasts.
-            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means", or
+            kind: "newey-west" or "hc3" one step ahead; on the free run "batch-means",
+                "batch-means-uneven" where the errors are white and of uneven size, or
                 "autoregressive" for errors of an autoregressive process; None for the first that
                 there is.
 
         Raises:
-            InputError: a fit without standard errors or with a parameter at a bound; errors that
-                remember each other for too long; a kind that is not for this criterion.
+            InputError: a fit without standard errors or statistics; errors that remember each
+                other for too long; a kind that is not for this criterion.
         """
-        if self.model.coloured:
-            raise InputError(
-                "robust standard errors are for fits without a noise model; its own are those of "
-                "white innovations."
-            )
-        simulates = self.criterion.free_run is not None
-        kinds = (
-            ("batch-means", "batch-means-uneven", "autoregressive")
-            if simulates
-            else ("newey-west", "hc3")
-        )
+        kinds = self.robust_kinds
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
-        if self.covariance is None or self.at_bound or (simulates and self.scores is None):
-            raise InputError(
-                "robust standard errors need a fit with standard errors and no parameter at a "
-                "bound."
-            )
-        if simulates:
-            return replace(self._robust_free_run(lags, kind), std_kind=kind)
-        if kind == "hc3":
-            return self._hc3()
-        residual = self.model.predict(self.problem.record).errors
-        used = (self.problem, residual, self.effective_weights, lags)
-        if self.measure is None and self.model.shared is None:
-            covariance = robust_covariance(*used)
-        else:
-            slope = self._slope()
-            covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
-        plain = self.covariance if self.plain_covariance is None else self.plain_covariance
-        covariance = self._enlarge(covariance, self.model.statistics)
-        return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
-
-    def _hc3(self) -> Estimate:
-        """Return the fit with each row's own error in place of one noise variance."""
-        statistics = self.plain_statistics or self.model.statistics
+        statistics = self.model.statistics
         if (
-            statistics.gram is None
+            self.scores is None
+            or self.covariance is None
+            or statistics.gram is None
             or self.model.numbers.tilt is not None
-            or isinstance(self.problem, StreamedProblem)
         ):
             raise InputError(
                 "the fit has no statistics for robust standard errors; fit the data again."
             )
-        residual = self.model.predict(self.problem.record).errors
-        slopes, share = (
-            one_step_slopes(self.problem, self.model),
-            self.problem.count / len(self.problem.rows),
-        )
-        own = hc3(
-            statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share
-        )
-        return replace(
+        steps = None if lags is None else check_count(lags, "lags")
+        used = len(self.theta) + self.effective_weights
+        modelled = kind == "autoregressive"
+        own = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
+        changed = replace(
             self,
             model=replace(self.model, statistics=own),
-            covariance=self._enlarge(self._cov_along(own, self._slope()), own),
             plain_covariance=self.covariance
             if self.plain_covariance is None
             else self.plain_covariance,
-            plain_statistics=statistics,
-            std_kind="hc3",
+            plain_statistics=statistics if self.plain_statistics is None else self.plain_statistics,
+            freedom=own.freedom,
+            std_kind=kind,
         )
+        return changed._renewed()
 
-    def _enlarge(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
-        """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
-        return enlarge_covariance(
-            covariance, statistics, None if self.model.shared is None else self.problem.shared
-        )
+    def _renewed(self: Fit) -> Fit:
+        """Return the fit with the covariance of θ̂ that follows from the model's statistics."""
+        raise NotImplementedError
 
-    def _robust_free_run(self, steps: int | None, kind: str) -> Estimate:
-        """Return the fit with robust standard errors of its free run.
+    @property
+    def theta(self) -> Vector:
+        """θ̂ (nθ,); of a motion the coordinates of p̂ (np,)."""
+        return self.model.theta
 
-        From blocks of so many steps, or from the colour of its errors.
+    @property
+    def coordinates(self) -> Coordinates:
+        """The parameters, and the map from θ̂ to their values."""
+        return self.model.form.coordinates
+
+    @property
+    def values(self) -> Vector:
+        """The parameters' values: θ̂ (nθ,), or p̂ (np,) of a motion."""
+        return np.asarray(self.coordinates.physical(self.theta))
+
+    @property
+    def std(self) -> Vector | None:
+        """Standard errors of the values, NaN where one has none."""
+        return self._std_of(self.covariance)
+
+    @property
+    def plain_std(self) -> Vector | None:
+        """The standard errors for white noise, where those of `std` are robust.
+
+        None where they are not.
         """
-        assert self.scores is not None
-        statistics = self.model.statistics
-        if statistics.gram is None or self.model.numbers.tilt is not None:
-            raise InputError(
-                "the fit has no statistics for robust standard errors; fit the data again."
-            )
-        steps = None if steps is None else check_count(steps, "lags")
-        used = len(self.theta) + self.effective_weights
-        modelled = kind == "autoregressive"
-        statistics = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
+        return self._std_of(self.plain_covariance)
+
+    def _std_of(self, covariance: Matrix | None) -> Vector | None:
+        """Return standard errors by the delta method, from a covariance of θ̂."""
+        if covariance is None:
+            return None
+        return np.sqrt(np.diag(covariance)) * np.abs(self.coordinates.slopes(self.theta))
+
+    @property
+    def interval(self) -> Matrix | None:
+        """95 % intervals of the values (nθ, 2); those of positive parameters are positive."""
+        if self.covariance is None:
+            return None
+        std = np.sqrt(np.diag(self.covariance))
+        return self._ends(interval(self.theta, std, max(self.freedom, 1.0)))
+
+    def _ends(self, limits: Matrix) -> Matrix:
+        """Return intervals of θ̂ (nθ, 2) as those of the values."""
+        return np.stack([self.coordinates.physical(side) for side in limits.T], axis=-1)
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """Table with a row per parameter: unit, initial, value, std, 95 % interval.
+
+        Of a motion also whether a learner could imitate it, `shared`.
+        """
+        table = parameter_frame(self.coordinates.parameters, self.values, self.std, self.interval)
+        return table.assign(**self._more_columns())
+
+    def _more_columns(self) -> dict[str, Any]:
+        """Return further columns of `parameters`."""
+        return {}
+
+    @property
+    def layout(self) -> Layout:
+        """Names of the entries of `reach`."""
+        return self.problem.layout
+
+    def reach(self, record: Record) -> Matrix:
+        """Return the points of a record at which the physics is evaluated, (N, nx)."""
+        return self.model.reach(record)
+
+    def __repr__(self) -> str:
+        values = zip(self.coordinates.parameters, self.values, strict=True)
+        return (
+            f"Estimate({self.model.structure}, {self.status.code}, loss "
+            f"{self.status.loss:.3g}, {', '.join(f'{p.name} = {v:.6g}' for p, v in values)})"
+        )
+
+    @property
+    def learns(self) -> bool:
+        """False where the physics is alone."""
+        return self.model.learns
+
+    @cached_property
+    def terms(self) -> pd.DataFrame:
+        """Table with a row per term of a learner of terms: coefficient, unit, std, 95 % interval.
+
+        Else empty.
+        """
+        return term_frame(learned_terms(self.model))
+
+    def equation(self, writing: str = "text") -> str:
+        """Return the fitted equations with their numbers, where the learner is a sum of terms.
+
+        As "text", "latex", "python".
+
+        Raises:
+            InputError: another learner, physics that are Python functions, another writing.
+        """
+        return equation(self.model, writing)
+
+    @cached_property
+    def over_experiments(self) -> OverExperiments | None:
+        """Errors of θ̂ for experiments like those fitted, by leaving out one after the other.
+
+        Those of `std` and `interval` hold for the inputs that were applied. None where there are
+        fewer than three experiments, or no standard errors.
+        """
+        if self.covariance is None or self.model.numbers.tilt is not None:
+            return None
+        if self.problem.record.recordings[-1] + 1 < FEWEST:
+            return None
+        changes = self._changes_without_each()
+        return None if changes is None else self._over_experiments(changes)
+
+    def _changes_without_each(self) -> Matrix | None:
+        """Return the changes of θ̂ (E, nθ) where each experiment is left out, to first order."""
+        raise NotImplementedError
+
+    def _over_experiments(self, changes: Matrix) -> OverExperiments:
+        slopes = self.coordinates.slopes(self.theta)
+        found = over_experiments(
+            changes, np.asarray(self.covariance), self.freedom, self.theta, slopes
+        )
+        return replace(found, interval=self._ends(found.interval))
+
+    def moves_by(self) -> tuple[Matrix, Vector] | None:
+        """Return the derivative of θ by (c, w), and which entries of these move."""
+        raise NotImplementedError
+
+    def _changes_of_free_run(self, free_run: Simulation) -> Matrix | None:
+        """Return what leaving an experiment out of the training on the free run changes (E, nθ).
+
+        The points of the split stay.
+        """
+        statistics, moves = self.model.statistics, self.moves_by()
+        if self.scores is None or statistics.gram is None or moves is None:
+            return None
+        scores = self.scores.by_recording(self.problem.record, free_run.washout)
+        if scores is None:
+            return None
+        k, free = moves
+        nt = len(self.theta)
+        information = statistics.information(nt)[np.ix_(free, free)]
+        half = half_inverse(information, int(free[:nt].sum()))
+        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * left_out(len(scores))
+
+    def withheld(self: Fit, kind: str, why: Warning) -> Fit:
+        """Return the fit without standard errors and intervals of θ, terms and predictions.
+
+        A warning says why.
+        """
+        statistics = replace(self.model.statistics, middle=None)
         return replace(
             self,
             model=replace(self.model, statistics=statistics),
-            covariance=self._cov_along(statistics, self._slope()),
-            plain_covariance=self.covariance
-            if self.plain_covariance is None
-            else self.plain_covariance,
-            plain_statistics=self.model.statistics
-            if self.plain_statistics is None
-            else self.plain_statistics,
-            freedom=statistics.freedom,
+            covariance=None,
+            plain_covariance=None,
+            plain_statistics=None,
+            std_kind=kind,
+            warnings=(*self.warnings, why),
         )
 
-    def _cov_along(self, statistics: Statistics, slope: Matrix) -> Matrix | None:
-        """Return Cov of `θ = c + θ_aux(w)` from statistics of (c, w)."""
-        joint = statistics.joint(len(self.theta))
-        return (
-            None if joint is None else joint.of(np.column_stack([np.eye(len(self.theta)), slope]))
-        )
+    def _heading(self) -> list[str]:
+        """Return the lines of `summary` on physics, learner, data and split."""
+        raise NotImplementedError
 
-    def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return the derivative [I ∂θ_aux/∂w] of θ by (c, w), and which entries of these move."""
-        k = np.column_stack([np.eye(len(self.theta)), self._slope()])
-        return k, np.ones(k.shape[1], dtype=bool)
-
-    def _slope(self) -> Matrix:
-        """Return ∂θ_aux/∂w under the measure that θ was split under."""
-        if self.measure is not None and self.measure.slope is not None:
-            return self.measure.slope
-        problem = self.problem
-        if isinstance(problem, StreamedProblem):
-            return streamed_slope(self.model, problem)
-        points = Points(problem.rows.x, np.ones(len(problem.rows)))
-        unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
-        return learner_slope(self.model, points, problem.projection, unit, problem.noise)
-
-    def _changes_without_each(self) -> Matrix | None:
-        problem, split = self.problem, self.measure
-        if self.at_bound or isinstance(problem, StreamedProblem):
-            return None
-        recordings = problem.record.recordings
-        experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
-        whole = split is None and self.model.shared is None
-        if self.criterion.one_step and (whole or not self.learns):
-            return split_without_each(
-                problem.projection, None, problem.unexplained, owner, experiments
-            )
-        free_run = self.criterion.free_run
-        changes = (
-            self._changes_of_rows(owner, experiments)
-            if free_run is None
-            else self._changes_of_free_run(free_run)
-        )
-        measure = Training() if split is None or split.measure is None else split.measure
-        if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
-            return changes
-        weighed = weigh_problem(measure, problem)
-        values = weighed.times(self.model.learner_at(weighed.points.x))
-        every = np.tile(owner, len(values) // len(owner))
-        found = split_without_each(
-            weighed.projection, self.model.shared, values, every, experiments
-        )
-        return None if found is None else changes + found
-
-    def _changes_of_rows(self, owner: Vector, experiments: int) -> Matrix | None:
-        """Return what leaving an experiment out of the training one step ahead changes (E, nθ)."""
-        if self.model.statistics.gram is None:
-            return None
-        problem = self.problem
-        errors = self.model.predict(problem.record).errors
-        matrix = problem.weight.matrix
-        influence = row_influence(problem, self.model, self._slope())
-        rows = np.einsum("kto,ko->kt", influence, errors @ (matrix.T @ matrix))
-        found = np.stack([rows[owner == e].sum(axis=0) for e in range(experiments)])
-        return -found * left_out(experiments)
-
-    def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
-        """Return the physical parameters of θ̂, with intervals by the delta method."""
-        order, covariance = self._in_order_of(physics)
-        return solve(physics, self.theta[order], covariance, freedom=max(self.freedom, 1.0))
-
-    def physical_profile(self, physics: PhysicsMap, name: str) -> tuple[float, float]:
-        """Return the 95 % profile-likelihood interval of one physical parameter.
-
-        A side without limit is infinite.
-        """
-        order, covariance = self._in_order_of(physics)
-        if covariance is None:
-            raise InputError("θ has no standard errors, so physical parameters have no profile.")
-        return profile(physics, self.theta[order], covariance, name, freedom=max(self.freedom, 1.0))
-
-    def _in_order_of(self, physics: PhysicsMap) -> tuple[list[int], Matrix | None]:
-        order = order_of(physics, self.problem.baseline.names, self.problem.record.sampling_time)
-        return order, None if self.covariance is None else self.covariance[np.ix_(order, order)]
-
-    def lines(self) -> list[str]:
-        baseline, learner = self.problem.baseline, str(self.model.form.bound)
-        if self.learns:
-            learner += f", {self.effective_weights:.1f} effective"
-        lines = [
-            f"structure   {self.model.structure}",
-            f"learner     {learner}",
-            f"data        {self.problem.record!r}, {self.problem.count} usable rows",
-            *self.status.lines,
-        ]
-        if self.defect is not None:
-            weight = self.problem.weight
-            lines.append(
-                f"orthogonal  ‖QᵀF̃‖/‖F‖ = {self.defect:.1e}"
-                + ("" if weight.one_output else f", {weight}")
-            )
-        condition = self.excitation.condition
-        lines.append(
-            f"excitation  rank {self.excitation.rank} of {self.excitation.columns}"
-            + (f", condition {condition:.3g}" if condition else "")
-        )
-        if self.measure is not None:
-            lines.append(f"measure     {self.measure}")
-        one_step = self.one_step_theta
-        if one_step is not None:
-            moved = ", ".join(
-                f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True)
-            )
-            lines.append(f"one step    Φ⁺Y would give {moved}")
+    def lines(self, interval_head: str = INTERVAL_HEAD) -> list[str]:
+        """Return the lines of `summary` before its warnings; intervals have the given head."""
+        heading = self._heading()
         if self.plain_covariance is not None:
-            lines.append(f"std         {STD_KINDS[self.std_kind]}")
+            heading.append(f"std         {STD_KINDS[self.std_kind]}")
         if self.model.noise is not None:
-            lines.append(f"noise       {'; '.join(each.text for each in self.noise)}")
-        lines += ["", *parameter_lines(baseline.parameters, self.theta, self.std, self.interval)]
-        return [*lines, *term_lines(learned_terms(self.model))]
-
-
-def order_of(physics: PhysicsMap, names: Sequence[str], sampling_time: float) -> list[int]:
-    """Return the places among `names` of the θ that the physics gives.
-
-    Raises:
-        InputError: no PhysicsMap, a θ that is not among them, a constant `Ts` that is not the
-            sampling time.
-    """
-    check_type(physics, PhysicsMap, "physics", "a PhysicsMap, such as PhysicsMap.of(…)")
-    check_sampling_constant(physics.constants, sampling_time)
-    missing = [name for name in physics.theta_names if name not in names]
-    if missing:
-        raise InputError(
-            f"the physics gives {', '.join(missing)}, which the baseline does not have."
+            heading.append(f"noise       {'; '.join(each.text for each in self.noise)}")
+        rows = parameter_lines(
+            self.coordinates.parameters, self.values, self.std, self.interval, interval_head
         )
-    return [names.index(name) for name in physics.theta_names]
+        return [*heading, "", *rows, *term_lines(learned_terms(self.model), interval_head)]
+
+    def summary(self) -> str:
+        """Return a page of text: status, parameters with their uncertainty, warnings."""
+        warnings = (
+            ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
+        )
+        return "\n".join(fold([*self.lines(), *warnings]))
+
+
+def left_out(experiments: int) -> float:
+    """Return by how much more θ̂ changes where an experiment is left out than by its own score."""
+    return experiments / (experiments - 1)
+
+
+def parameter_frame(
+    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+) -> pd.DataFrame:
+    """Return a table with a row per parameter: unit, initial, value, std, 95 % interval.
+
+    NaN where there is none.
+    """
+    import pandas as pd
+
+    from orthaug._base.frames import EstimateFrame
+
+    nothing = np.full(len(parameters), np.nan)
+    ci = np.stack([nothing, nothing], axis=-1) if ci is None else ci
+    return EstimateFrame(
+        {
+            "unit": [p.unit for p in parameters],
+            "initial": [p.initial for p in parameters],
+            "value": values,
+            "std": nothing if std is None else std,
+            "ci95_low": ci[:, 0],
+            "ci95_high": ci[:, 1],
+        },
+        index=pd.Index([p.name for p in parameters], name="parameter"),
+    )
+
+
+def parameter_lines(
+    parameters: Sequence[Any],
+    values: Vector,
+    std: Vector | None,
+    ci: Matrix | None,
+    interval_head: str = INTERVAL_HEAD,
+) -> list[str]:
+    """Return the parameters as lines of text, a heading first; a dash for no interval."""
+    rows = [
+        (value, None, None)
+        if std is None or ci is None or not np.isfinite(std[i])
+        else (value, std[i], ci[i].tolist())
+        for i, value in enumerate(values)
+    ]
+    cells = estimate_rows(rows)
+    head = ["parameter", "value", "std", interval_head, "initial", "unit"]
+    rows = [
+        [p.name, *own, f"{p.initial:.5g}", p.unit] for p, own in zip(parameters, cells, strict=True)
+    ]
+    return table([head, *rows], drop=["initial"])

@@ -2,97 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 
-from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
-from orthaug._base.errors import InputError, Warning, show
+from orthaug._base.checks import check_type
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.data.sources import Source, witness
-from orthaug.fitting.any_fit import AnyFit
-from orthaug.fitting.checkpoints import Checkpoints
-from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.data.sources import Source
+from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.focus import choose_focus
-from orthaug.fitting.free_run import FreeRunTask
-from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.fit_plans import (
+    FitPlan,
+    Regularization,
+    Request,
+    check_blocks,
+    check_regularizations,
+    check_types,
+    plan_for,
+    plan_of,
+    rows_in_memory,
+)
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.motion_estimates import MotionEstimate
-from orthaug.fitting.motion_estimation import DEFAULT, fit_motion, pose_for
-from orthaug.fitting.noise import Noise, declared_noise
-from orthaug.fitting.noise_estimation import check_noise, fit_coloured
-from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.noise import Noise
 from orthaug.fitting.rules import (
-    check_no_memory,
     check_sizes,
     check_solver,
     checked_starts,
     choose_regularizations,
 )
+from orthaug.fitting.setup import TrainingSetup
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import Choice, PlannedRun, plan_runs, train
-from orthaug.inference.covariance import whitening_matrix
-from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Learner, Scaling, declared, learns
+from orthaug.fitting.training import PlannedRun, plan_runs, train
+from orthaug.models.learners import MLP, Learner, declared, learns
 from orthaug.models.model import Model
-from orthaug.models.rows import Engine, InMemory
-from orthaug.models.tasks import Tasks, runs_on
-from orthaug.models.terms import over_lags, over_states
+from orthaug.models.rows import Engine
+from orthaug.models.tasks import runs_on
 from orthaug.physics.baseline import Baseline
+from orthaug.physics.closed_loop import in_loop
+from orthaug.physics.controller import Controller
 from orthaug.physics.motion import Motion
-from orthaug.physics.output_weights import by_covariance
-from orthaug.physics.problem import Problem, pose
-from orthaug.physics.streamed import StreamedProblem, pose_streamed
+from orthaug.physics.problem import MotionProblem, Problem
 from orthaug.physics.systems import System
-
-_TURNS = 30
-_SETTLED = 1e-6  # relative change of W
-
-
-def reweight(first: Estimate, again: Callable[[Problem, Estimate], Estimate]) -> Estimate:
-    """Return the fit whose outputs are weighted by the covariance of its own errors.
-
-    Args:
-        first: a fit with any output weights.
-        again: the fit of a problem with other weights, begun from an earlier estimate.
-
-    Returns:
-        The last fit, with the restarts of the first one. It keeps its weights where the errors'
-        covariance is singular; a warning says that the turns did not settle.
-    """
-    estimate, problem = first, first.problem
-    covariance = problem.target_covariance
-    for _ in range(_TURNS):
-        noise = estimate.model.statistics.noise if estimate.status.ok else None
-        white = None if noise is None else whitening_matrix(noise)
-        if white is None:
-            return replace(estimate, restarts=first.restarts)
-        weight = by_covariance(white, covariance)
-        change = np.linalg.norm(weight.matrix - problem.weight.matrix) / np.linalg.norm(
-            weight.matrix
-        )
-        if change <= _SETTLED:
-            return replace(estimate, restarts=first.restarts)
-        problem = problem.weigh(weight)
-        estimate = again(problem, estimate)
-    text = (
-        f"the weights of the outputs still change by {change:.1g} after {_TURNS} fits, so θ "
-        "depends on where the iteration stopped."
-    )
-    warnings = (*estimate.warnings, Warning("output_weights_unsettled", text))
-    return replace(estimate, restarts=first.restarts, warnings=warnings)
-
-
-Regularization = str | float
 
 
 class Options(TypedDict, total=False):
@@ -109,18 +67,19 @@ class Options(TypedDict, total=False):
     ensemble: bool
     blocks: int
     fallback: bool
-    initial: Estimate | MotionEstimate | Model | None
+    initial: Estimate | Model | None
     validation: Record | None
     output_weights: str | Sequence[float]
     progress: ProgressCallback | bool
     engine: Engine | None
     noise: Noise
+    controller: Controller | None
 
 
 @overload
 def estimate(
     record: Record | Source, baseline: Baseline, **options: Unpack[Options]
-) -> Estimate: ...
+) -> LaggedEstimate: ...
 @overload
 def estimate(
     record: Record, baseline: Motion | System, **options: Unpack[Options]
@@ -141,13 +100,14 @@ def estimate(
     ensemble: bool = False,
     blocks: int = 4,
     fallback: bool = True,
-    initial: Estimate | MotionEstimate | Model | None = None,
+    initial: Estimate | Model | None = None,
     validation: Record | None = None,
     output_weights: str | Sequence[float] = "auto",
     progress: ProgressCallback = SILENT,
     engine: Engine | None = None,
     noise: Noise = "white",
-) -> Estimate | MotionEstimate:
+    controller: Controller | None = None,
+) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
 
     The criterion is the prediction error (eq:cost_fun), or the error of a free run.
@@ -196,10 +156,14 @@ def estimate(
         progress: called about twice a second with (restart, iteration, loss); True for a bar.
         engine: who sums over the rows: `Stream()`, `Devices()`, `Dask(client)`; None for what suits
             the record.
-        noise: model of the errors of lagged physics one step ahead, in memory: "white",
+        noise: model of the errors, in memory. Of lagged physics one step ahead: "white",
             `ARMA(ar, ma)` for `y = φθ + f + (C/D) e`, "arma" for `ARMA(1, 1)`, or "auto" to choose
             the orders, white among them. Its coefficients are estimated with θ and learner by
-            prediction error. With the criterion `Auto()` one step ahead is trained.
+            prediction error. With the criterion `Auto()` one step ahead is trained. Of a motion:
+            "white", "innovations" or `Innovations()` for process noise and sensor noise, or "auto".
+        controller: of a `Motion` that was recorded in a loop, such as `Controller.pid(…)`: its free
+            run is the loop's, from the references. The record's inputs are these and what else
+            drives the plant; an input that the controller sets may be one of its outputs.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -214,396 +178,108 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
-    options: dict[str, Any] = {
-        "structure": structure,
-        "solver": solver,
-        "regularization": regularization,
-        "seed": seed,
-    }
-    options |= {
-        "restarts": restarts,
-        "fallback": fallback,
-        "validation": validation,
-        "progress": progress,
-    }
     if isinstance(baseline, System):
-        check_record(record, moves=True)
-        assert isinstance(record, Record)
-        baseline = baseline.motion(record)
-    check_type(initial, AnyFit | Model | None, "initial", "an Estimate, a Model or None")
-    model = initial.model if isinstance(initial, AnyFit) else initial
-    if isinstance(baseline, Motion):
-        if noise != "white":
-            raise InputError(
-                "a motion has white noise on its outputs; leave out `noise`, or fit the physics in "
-                "its lagged form."
-            )
-        if lags is not None:
-            raise InputError(
-                "a motion has no `lags`: its learner sees states and inputs; leave them out."
-            )
-        if ensemble:
-            raise InputError(
-                "a motion has no `ensemble`: medians of outputs follow no equations of motion; "
-                "leave it out."
-            )
-        check_record(record, moves=True)
-        assert isinstance(record, Record)
-        learner = over_states(learner, baseline)
-        problem = pose_for(record, baseline, learner, output_weights, model)
-        options |= {
-            "initial": model,
-            "criterion": criterion or DEFAULT,
-            "blocks": _check_blocks(blocks),
-            "engine": engine or InMemory(),
-        }
-        return fit_motion(problem, learner=learner, **options)
-    check_record(record)
-    _check_types(baseline=baseline, lags=lags, learner=learner)
-    criterion = Prediction() if criterion is None else criterion
-    if model is not None and not model.form.separates:
-        raise InputError("`initial` is a motion, which has no regressor; fit anew.")
-    channels = (
-        tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
+        baseline = baseline.motion(rows_in_memory(record))
+    check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
+    physics = in_loop(baseline, controller, record)
+    model = initial.model if isinstance(initial, Estimate) else initial
+    problem, learner, engine = plan_for(physics).pose(
+        record,
+        physics,
+        lags=lags,
+        learner=learner,
+        output_weights=output_weights,
+        initial=model,
+        engine=engine,
     )
-    learner = over_lags(learner, baseline, lags, *channels)
-    inputs = declared(learner).inputs
-    if model is not None:
-        inputs = tuple(str(entry) for entry in model.form.entries)
-    _check_types(criterion=criterion)
-    problem, engine = pose_source(
-        record, engine, baseline, lags, inputs, output_weights=output_weights
+    return fit(
+        problem,
+        learner=learner,
+        structure=structure,
+        criterion=criterion,
+        solver=solver,
+        regularization=regularization,
+        restarts=restarts,
+        seed=seed,
+        ensemble=ensemble,
+        blocks=blocks,
+        fallback=fallback,
+        initial=model,
+        validation=validation,
+        progress=progress,
+        engine=engine,
+        noise=noise,
     )
-    options |= {
-        "criterion": criterion,
-        "ensemble": ensemble,
-        "blocks": blocks,
-        "initial": model,
-        "engine": engine,
-        "noise": noise,
-    }
-    return fit(problem, learner=learner, **options)
 
 
-def fit(
-    problem: Problem,
-    *,
-    learner: Learner | None = MLP(),  # noqa: B008  (frozen)
-    structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
-    criterion: Criterion = Prediction(),  # noqa: B008  (frozen)
-    solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
-    regularization: Regularization | Sequence[Regularization] = "auto",
-    restarts: int = 1,
-    seed: int = 0,
-    ensemble: bool = False,
-    blocks: int = 4,
-    fallback: bool = True,
-    initial: Model | None = None,
-    validation: Record | None = None,
-    progress: ProgressCallback = SILENT,
-    engine: Engine = InMemory(),  # noqa: B008  (frozen)
-    checkpoints: Checkpoints | None = None,
-    noise: Noise = "white",
-) -> Estimate:
-    """Fit a problem that is posed already; arguments as of `estimate`.
+@overload
+def fit(problem: Problem, **options: Any) -> LaggedEstimate: ...
+@overload
+def fit(problem: MotionProblem, **options: Any) -> MotionEstimate: ...
+def fit(problem: Problem | MotionProblem, **options: Any) -> Estimate:
+    """Fit a problem that is posed already.
 
     Args:
-        problem: record, physics and learner inputs; the other arguments as of `estimate`.
-        learner: None for physics alone, on the rows of the problem.
-        engine: where the rows are, or segments of a free run, and who sums over them. On a cluster
-            several runs over rows that are in memory are tasks, each whole on one worker, and so
-            are their held-out blocks.
-        checkpoints: where the states of its runs are kept, to go on from; None to keep none.
+        problem: record, physics and learner inputs.
+        options: the fields of `Request`: the arguments of `estimate` and `checkpoints`, where the
+            states of its runs are kept, to go on from. `learner` None is physics alone, on the rows
+            of the problem. `engine` says where the rows are, or segments of a free run, and who
+            sums over them. On a cluster several runs over rows that are in memory are tasks, each
+            whole on one worker, and so are their held-out blocks.
 
     Raises:
         InputError: as `estimate`.
     """
-    _check_types(learner=learner, structure=structure, criterion=criterion, solver=solver)
-    _check_types(initial=initial, validation=validation)
-    options: dict[str, Any]
-    learner = declared(learner)
-    check_no_memory(learner)
-    _check_splittable(structure, problem.baseline, learner)
-    coloured = declared_noise(noise)
-    if coloured is not None:
-        check_noise(problem, solver, structure, criterion, engine, ensemble=ensemble)
-        options = {
-            "learner": learner,
-            "structure": structure,
-            "criterion": criterion,
-            "solver": solver,
-            "regularization": regularization,
-            "restarts": restarts,
-            "seed": seed,
-            "blocks": blocks,
-            "fallback": fallback,
-            "initial": initial,
-            "validation": validation,
-            "progress": progress,
-            "engine": engine,
-        }
-        return fit_coloured(problem, coloured, fit, options)
-    if criterion.automatic and _may_decide(
-        problem, solver, structure, warm=initial is not None, ensemble=ensemble
-    ):
-        options = {
-            "learner": learner,
-            "structure": structure,
-            "solver": solver,
-            "seed": seed,
-        }
-        options |= {
-            "regularization": regularization,
-            "restarts": restarts,
-            "blocks": blocks,
-            "fallback": fallback,
-        }
-        options |= {
-            "validation": validation,
-            "progress": progress,
-            "engine": engine,
-            "checkpoints": checkpoints,
-        }
-        return choose_focus(problem, fit, options, criterion)
-    criterion = _settle(criterion, problem)
-    blocks = _check_blocks(blocks)
-    given = {
-        "linear": problem.baseline.linear,
-        "validated": validation is not None,
-        "learner": learner,
-    }
-    choices = choose_regularizations(regularization, solver, criterion, structure, **given)
-    auto = _check_regularizations(regularization, choices, validation is not None or blocks > 0)
-    restarts, seed = checked_starts(restarts, seed, warm=initial is not None, ensemble=ensemble)
-    check_solver(solver, criterion, choices if learns(learner) else ())
-    engine = _for_runs(engine, problem, len(choices) * (restarts if initial is None else 1))
-    warm, warnings = None, ()
-    if initial is not None:
-        task, weights, warm = _warm_start(problem, initial, engine)
-        starts = [PlannedRun(0, weights, choice) for choice in choices]
-    else:
-        runs = restarts * len(choices)
-        check_sizes(problem, learner, iterations=solver.iterations, runs=runs, room=engine.room())
-        if problem.noise is None:  # a fit under a noise model has left them out already
-            problem, learner, warnings = independent_terms(problem, learner)
-        task = OneStepTask.of(problem, learner, engine=engine)
-        starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
-    solved = criterion.one_step and problem.baseline.linear
-    alone = not task.bound.learns
-    ensemble = _check_ensemble(ensemble and not alone, problem)
-    if alone and solved:
-        estimate = _physics_alone(task, structure)
-    else:
-        # Not a worker's disk
-        task = replace(task, checkpoints=None if isinstance(task.engine, Tasks) else checkpoints)
-        trained = task if solved else FreeRunTask.of(task, criterion, warm)
-        chosen = Choice(
-            validation, blocks if initial is None else 0, fallback, ensemble, scored=auto and solved
-        )
-        estimate = train(trained, starts, structure, solver, chosen, progress, runner=engine)
-        if _splits(structure) and estimate.status.ok and estimate.learns:
-            estimate = estimate.split(structure.measure)
-    estimate = replace(estimate, warnings=(*warnings, *estimate.warnings))
-    if problem.weight.choice != "covariance" or problem.weight.kind == "covariance" or not solved:
-        return estimate
-    more = {
-        "learner": learner,
-        "structure": structure,
-        "criterion": criterion,
-        "solver": solver,
-        "engine": engine,
-    }
-    return reweight(estimate, partial(_refit_weights, **more, progress=progress))
+    plan = plan_of(problem, _checked(Request(**options)))
+    plan.check()
+    made = plan.by_other_fits(fit)
+    made = _fit_once(plan) if made is None else made
+    asked = plan.request.options(learner=plan.learner, criterion=plan.asked)
+    return replace(made, setup=TrainingSetup.of(fit, problem, asked))
 
 
-def _refit_weights(problem: Problem, last: Estimate, **options: Any) -> Estimate:
-    """Return the fit to other weights of the outputs, from the end of the last fit."""
-    chosen = next((r.regularization for r in last.restarts if r.chosen), "none")
-    start = last.model if last.learns else None
-    return fit(problem, initial=start, regularization=chosen, **options)
+def _checked(request: Request) -> Request:
+    """Return a request whose values are of the right types."""
+    check_types(learner=request.learner, structure=request.structure, solver=request.solver)
+    check_types(initial=request.initial, validation=request.validation)
+    if request.criterion is not None:
+        check_types(criterion=request.criterion)
+    return replace(request, learner=declared(request.learner))
 
 
-def _may_decide(
-    problem: Problem, solver: Solver, structure: Structure, *, warm: bool, ensemble: bool
-) -> bool:
-    """Return whether the data may decide for the free run.
-
-    They may not where only one step ahead can be trained.
-    """
-    able = (
-        solver.gauss_newton and problem.baseline.linear and not isinstance(problem, StreamedProblem)
+def _fit_once(plan: FitPlan[Any]) -> Any:
+    """Return the estimate of one problem with one criterion."""
+    problem, request, criterion = plan.problem, plan.request, plan.settled()
+    blocks, validated = check_blocks(request.blocks), request.validation is not None
+    learner, given = plan.learner, request.regularization
+    choices = choose_regularizations(
+        given,
+        request.solver,
+        criterion,
+        request.structure,
+        linear=problem.linear,
+        validated=validated,
+        motion=plan.by_evidence,
+        learner=learner,
     )
-    return able and not (warm or ensemble or structure.from_initial)
-
-
-def _settle(criterion: Criterion, problem: Problem) -> Criterion:
-    """Return the criterion with its open choices made for the record.
-
-    One step ahead where nothing else can be trained.
-    """
-    criterion = Prediction() if criterion.automatic else criterion
-    if isinstance(problem, StreamedProblem):
-        return criterion.streamed
-    return criterion.on(problem.record, problem.first_row)
-
-
-def _for_runs(engine: Engine, problem: Problem, runs: int) -> Engine:
-    """Return the engine by which several runs over rows in memory are tasks of a cluster."""
-    return runs_on(engine) if runs > 1 and not isinstance(problem, StreamedProblem) else engine
-
-
-def _physics_alone(task: OneStepTask, structure: Structure) -> Estimate:
-    """Return physics alone, which is solved: it ends at the loss where it starts."""
-    estimate = conclude(task, structure, task.physics_learned())
-    return replace(estimate, status=replace(estimate.status, start_loss=estimate.status.loss))
-
-
-def _check_blocks(blocks: int) -> int:
-    """Return how many blocks are held out in turn.
-
-    Raises:
-        InputError: one, of which nothing would be left to train on.
-    """
-    blocks = check_count(blocks, "blocks", least=0)
-    if blocks == 1:
-        raise InputError("`blocks` must be 2 or more, or 0 for none; got 1.")
-    return blocks
-
-
-def _check_ensemble(ensemble: bool, problem: Problem) -> bool:
-    """Return whether an ensemble is asked for, and check the request.
-
-    Raise InputError for a median of outputs that are mixed with each other.
-    """
-    if ensemble and problem.weight.choice == "covariance":
-        raise InputError(
-            "an ensemble takes the median of each output; use `output_weights` std, none or "
-            "numbers."
-        )
-    return ensemble
-
-
-def _check_splittable(structure: Structure, baseline: Baseline, learner: Learner) -> None:
-    """Raise InputError for bounds on a θ that is split off after training."""
-    if not (_splits(structure) and learns(learner)):
-        return
-    bounded = [p.name for p in baseline.parameters if np.isfinite(p.min) or np.isfinite(p.max)]
-    if bounded:
-        raise InputError(
-            f"{', '.join(bounded)} have bounds, which hold under the training measure only. "
-            "Under another measure θ is computed after training, without bounds. Drop the "
-            "bounds or the measure."
-        )
-
-
-def _splits(structure: Structure) -> bool:
-    """Return whether θ is split off under another measure than that of training."""
-    return structure.measure != Training()
-
-
-def _warm_start(
-    problem: Problem, model: Model, engine: Engine
-) -> tuple[OneStepTask, Vector, Vector]:
-    """Return the task of training on from an earlier model's weights, in its scaling.
-
-    And the model's c.
-    """
-    bound, numbers = model.form.bound, model.numbers
-    if numbers.tilt is not None:
-        raise InputError(
-            "`initial` is an ensemble, which has no single weights to start from; fit anew."
-        )
-    if not bound.learns:
-        raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
-    if len(problem.outputs) != bound.ny:
-        raise InputError(
-            f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
-        )
-    scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
-    problem = problem.for_linear_learner() if model.form.features.linear else problem
-    task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
-    return task, np.asarray(numbers.weights), model.theta - model.theta_aux
-
-
-_TYPES: dict[str, tuple[Any, str]] = {
-    "baseline": (Baseline, "a Baseline or a Motion"),
-    "lags": (Lags | None, "Lags(…) or None"),
-    "learner": (Learner | None, "a learner such as MLP(), or None"),
-    "structure": (Structure, "a structure such as Orthogonal()"),
-    "criterion": (Criterion, "Prediction(…) or Simulation(…)"),
-    "solver": (Solver, "a solver such as LevenbergMarquardt()"),
-    "initial": (Model | None, "a Model or None"),
-    "validation": (Record | None, "a Record or None"),
-}
-
-
-def _check_types(**given: Any) -> None:
-    """Raise InputError for an argument of another type."""
-    for name, value in given.items():
-        kind, words = _TYPES[name]
-        check_type(value, kind, name, words)
-
-
-def _check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
-    """Return whether "auto" was given, and check the regularizations.
-
-    Raise InputError for what is none, or for several that nothing chooses between.
-    """
-    auto = isinstance(given, str) and given == "auto"
-    if len(choices) > 1 and not (auto or chosen):
-        raise InputError(
-            "several regularizations need `validation` or `blocks` to choose between them."
-        )
-    for choice in choices:
-        if isinstance(choice, str):
-            check_choice(choice, ("none", "evidence", "ard"), "`regularization`")
-        elif isinstance(choice, bool) or not isinstance(choice, int | float | np.number):
-            raise InputError(
-                "`regularization` must be auto, none, evidence, ard or a number; got "
-                f"{show(choice)}."
-            )
-        elif not (is_number(choice) and choice >= 0):
-            raise InputError(f"`regularization` must be 0 or more; got {show(choice)}.")
-    if not choices:
-        raise InputError("`regularization` is empty; give auto, none, evidence, ard or a number.")
-    return auto
-
-
-def pose_source(
-    record: Record | Source, engine: Engine | None, baseline: Baseline, *args: Any, **options: Any
-) -> tuple[Problem, Engine]:
-    """Return the problem with the engine that sums over its rows; further arguments as of `pose`.
-
-    Args:
-        engine: None for what suits the record: memory, a stream of its files, the cluster that
-            holds it.
-
-    Raises:
-        InputError: as `pose`.
-    """
-    if isinstance(record, Record):
-        return pose(record, baseline, *args, **options), InMemory() if engine is None else engine
-    engine = _engine_of(record) if engine is None else engine
-    return pose_streamed(record, witness(record), engine.passes, baseline, *args, **options), engine
-
-
-def _engine_of(source: Source) -> Engine:
-    client = getattr(source, "client", None)
-    if client is not None:
-        from orthaug.models.cluster import Dask
-
-        return Dask(client)
-    from orthaug.models.streaming import Stream
-
-    return Stream()
-
-
-def check_record(record: Any, *, moves: bool = False) -> None:
-    """Raise InputError for a record without rows, or with none in memory for a motion."""
-    if not isinstance(record, Source):
-        check_type(record, Record, "record", "a Record")
-    elif moves and not isinstance(record, Record):
-        raise InputError(
-            "a motion needs its rows in memory: read them with read_record or Record.join, or "
-            "fit the physics in its lagged form."
-        )
+    auto = check_regularizations(given, choices, validated or blocks > 0)
+    asked = {"warm": request.warm, "ensemble": request.ensemble}
+    restarts, seed = checked_starts(request.restarts, request.seed, **asked)
+    check_solver(request.solver, criterion, choices if learns(learner) else ())
+    runs = len(choices) * (1 if request.warm else restarts)
+    engine = request.engine if problem.streamed or runs == 1 else runs_on(request.engine)
+    iterations, room = request.solver.iterations, engine.room()
+    check_sizes(problem, learner, iterations=iterations, runs=runs, room=room)
+    plan = plan.on(replace(request, criterion=criterion, blocks=blocks, engine=engine))
+    prepared = plan.prepare()
+    task, structure, solver = prepared.task, request.structure, request.solver
+    estimate = plan.solve(task)
+    if estimate is None:
+        if request.initial is None:
+            starts = plan_runs(task.bound, range(seed, seed + restarts), choices)
+        else:
+            weights = np.asarray(request.initial.numbers.weights)
+            starts = [PlannedRun(0, weights, choice) for choice in choices]
+        chosen = plan.choice(auto=auto)
+        estimate = train(task, starts, structure, solver, chosen, request.progress, runner=engine)
+    return plan.finish(estimate, prepared, fit)

@@ -13,8 +13,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
-from orthaug.inference.motion_split import Field, rest_of
-from orthaug.inference.splitting import beyond_data
+from orthaug.inference.splitting import Field, beyond_data, rest_of
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 
@@ -117,7 +116,8 @@ def _sum_over(
 
     def mixed_derivative(x: Any, row: Any) -> Any:
         def half(q: Any, x: Any) -> Any:
-            return jnp.sum(rest_of(form, numbers, q, c, w, x, form.now(row), size) ** 2) / 2
+            u = form.inputs_at(numbers, x, row)
+            return jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2) / 2
 
         return jax.jacfwd(jax.grad(half), 1)(q, x)
 

@@ -1,9 +1,10 @@
 """The choice of `Auto` between one step ahead and the free run, by held-out free runs.
 
-A fit one step ahead stays where its free run is finite, no worse than that of physics alone, and
-where its residual is noise of the equation. Otherwise physics and learner are trained on the free
-run, too. Of all candidates, physics alone among them, the one is handed over that predicts the
-held-out free runs best. `benchmarks/defaults.py` has the records by which these rules were chosen.
+A fit one step ahead stays where its free run is finite, no worse than that of physics alone, where
+its residual is noise of the equation, and where no coloured errors move its parameters. Otherwise
+physics and learner are trained on the free run, too. Of all candidates, physics alone among them,
+the one is handed over that predicts the held-out free runs best. `benchmarks/defaults.py` has the
+records by which these rules were chosen.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import LOG
 from orthaug.data.record import Record
 from orthaug.fitting.colour import autocorrelation
@@ -29,7 +31,9 @@ from orthaug.fitting.held_out import (
     mean_square,
     squared_errors,
 )
-from orthaug.fitting.training import FOLD_ITERATIONS
+from orthaug.fitting.inconsistency import inconsistency
+from orthaug.fitting.setup import quick_options
+from orthaug.fitting.training import fold_solver
 from orthaug.fitting.unfinished import NOT_CONVERGED
 from orthaug.models.learners import learns
 
@@ -43,6 +47,19 @@ _LAGS = 20  # of the residual's autocorrelation
 # autocorrelation from which a residual is no noise of the equation, where it is significant, too
 _COLOURED = 0.1
 _SIGNIFICANT = 4.0  # standard deviations of the autocorrelation of white noise: one lag in 16,000
+# rows · parameters · iterations of the free run over all rows: half a minute on one core
+_FREE_WORK = 3e8
+
+_INCONSISTENT = (
+    "coloured errors, correlated with the lagged outputs, move its parameters by more than half a "
+    "standard error"
+)
+
+_CUT_SHORT = (
+    "no intervals: training on the free run stopped at its limit to save time, while the loss was "
+    "still falling. The parameters may still move by more than their standard errors. "
+    '`focus = "simulation"` trains to the end.'
+)
 
 Fit = Callable[..., Any]
 """Fits a problem: `fit(problem, learner=…, criterion=…, …)`."""
@@ -98,11 +115,9 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
         wrong = None if made is None else _beside_physics(made, [held], problem)
         if wrong is not None:
             return f"{wrong} {where}"
-    return (
-        "its residual is correlated with its past, as with sensor noise"
-        if _is_coloured(first)
-        else None
-    )
+    if _is_coloured(first):
+        return "its residual is correlated with its past, as with sensor noise"
+    return _INCONSISTENT if _is_inconsistent(first) else None
 
 
 def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | None:
@@ -131,27 +146,17 @@ def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, A
     """Return a fit to the first half, and the other half; nothing for too few rows."""
     try:
         training, held = held_out_blocks(problem.record, HALVES, problem.first_row)[-1]
-        return fit(problem.on(training), criterion=Prediction(), **_quick(options)), held
+        solver = fold_solver(options["solver"], 0, 0, free_run=False)
+        quick = _quick(options, solver)
+        return fit(problem.on(training), criterion=Prediction(), **quick), held
     except InputError:
         return None, None
 
 
-def _quick(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options for a quick fit to a part of the rows.
-
-    One start, few iterations, nothing to choose.
-    """
-    given = options["regularization"]
-    return {
-        **{name: value for name, value in options.items() if name != "progress"},
-        "restarts": 1,
-        "solver": options["solver"].at_most(FOLD_ITERATIONS),
-        "regularization": given[0] if isinstance(given, list | tuple) else given,
-        "blocks": 0,
-        "validation": None,
-        "fallback": False,
-        "checkpoints": None,
-    }
+def _quick(options: Mapping[str, Any], solver: Any) -> dict[str, Any]:
+    """Return options for a quick fit to a part of the rows, by another solver."""
+    own = {name: value for name, value in options.items() if name != "progress"}
+    return {**quick_options(own), "solver": solver, "fallback": False, "checkpoints": None}
 
 
 def _is_coloured(fit: Any) -> bool:
@@ -167,6 +172,17 @@ def _is_coloured(fit: Any) -> bool:
             if found is not None and np.any(np.abs(found[:_LAGS]) > limit):
                 return True
     return False
+
+
+def _is_inconsistent(fit: Any) -> bool:
+    """Return whether coloured errors, however small, move the one-step θ."""
+    with one_blas_thread():
+        found = inconsistency(fit, fit.model.predict(fit.problem.record))
+    return found is not None and found.found
+
+
+def _rows(record: Record) -> int:
+    return sum(map(len, record.experiments))
 
 
 def _free_run(criterion: Any, problem: Any) -> Any:
@@ -193,18 +209,22 @@ class _FocusChoice:
         """True where there is a learner to compare with physics alone."""
         return learns(self.options["learner"])
 
+    @property
+    def size(self) -> int:
+        """Number of parameters of physics and learner."""
+        return len(self.first.theta) + self.first.model.form.bound.size
+
     @cached_property
     def free(self) -> Any:
         """The fit on the free run, from one start, for all begin at physics alone.
 
-        Within its limit, to save time.
+        Small problems are trained to the end, large ones within the limit, to save time.
         """
-        chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1}
-        return self.fit(
-            self.problem,
-            criterion=self.free_run,
-            **chosen | {"solver": self.options["solver"].within_limit},
-        )
+        solver = self.options["solver"]
+        if solver.limit().longest * self.size * _rows(self.problem.record) > _FREE_WORK:
+            solver = solver.within_limit
+        chosen = {**self.options, "fallback": False, "blocks": 0, "restarts": 1, "solver": solver}
+        return self.fit(self.problem, criterion=self.free_run, **chosen)
 
     @cached_property
     def free_physics(self) -> Any:
@@ -254,8 +274,12 @@ class _FocusChoice:
             return [(self.problem.record, self.problem.record)]
 
     def _quick_fit(self, training: Record, criterion: Any) -> Any:
+        solver = fold_solver(
+            self.options["solver"], _rows(training), self.size, free_run=criterion is self.free_run
+        )
+        quick = _quick(self.options, solver)
         try:
-            return self.fit(self.problem.on(training), criterion=criterion, **_quick(self.options))
+            return self.fit(self.problem.on(training), criterion=criterion, **quick)
         except InputError:  # the block took away what the physics needs
             return None
 
@@ -273,7 +297,11 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Any:
     Only candidates whose free run over all rows is sound count.
     """
     errors = choosing.errors
-    ranked = _rank(errors, with_learner=choosing.learns and not choosing.options["fallback"])
+    ranked = _rank(
+        errors,
+        with_learner=choosing.learns and not choosing.options["fallback"],
+        consistent=reason == _INCONSISTENT,
+    )
     chosen = next((key for key in ranked if _sound(choosing, key)), None)
     lost = chosen is None
     key = (ONE_STEP, False) if chosen is None else chosen
@@ -288,11 +316,9 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Any:
         f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
     warnings = list(best.warnings)
-    if any(warning.code == NOT_CONVERGED for warning in warnings):
-        text += (
-            " Training on the free run stopped at its limit to save time; `focus = "
-            '"simulation"` trains to the end.'
-        )
+    if key[0] == FREE_RUN and any(warning.code == NOT_CONVERGED for warning in warnings):
+        warnings = [w for w in warnings if w.code != NOT_CONVERGED]
+        warnings.append(Warning(NOT_CONVERGED, _CUT_SHORT))
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
         beginning = (
@@ -313,10 +339,11 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Any:
     )
 
 
-def _rank(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
+def _rank(errors: Mapping[Key, float], *, with_learner: bool, consistent: bool) -> list[Key]:
     """Return the candidates by error, of similar ones the simplest first.
 
-    Wanted learners before physics.
+    Wanted learners before physics, and where θ is to be `consistent`, the free run before one step
+    ahead.
 
     Physics alone that was fitted to the free run comes before that of one step ahead where the
     errors of a few blocks do not clearly speak against it: it minimises what is compared.
@@ -324,6 +351,8 @@ def _rank(errors: Mapping[Key, float], *, with_learner: bool) -> list[Key]:
     among = [key for key in errors if key[1] or not with_learner]
     least = min(errors[key] for key in among)
     alike = [key for key in among if errors[key] <= _SLACK * least]
+    if consistent:
+        alike.sort(key=lambda key: key[0] != FREE_RUN)
     one_step, free_run = (ONE_STEP, False), (FREE_RUN, False)
     if (
         alike[:1] == [one_step]

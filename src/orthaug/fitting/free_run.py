@@ -22,6 +22,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed, settle
 from orthaug.fitting.initial_states import Start
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.segmented_lagged import SegmentedLagged, StructuredObjective
@@ -67,8 +68,12 @@ def train_physics_only(
         ends.append(plan.descend(objective, starts[int(np.argmin(losses))], solver, progress))
     if not np.isfinite(losses[0]) or not ends or not np.isfinite(ends[0].mean_square):
         ends += _lengthen(plan, solver, structure, starts)
-    if plan.whole is not plan.segments and plan.lengthens:
-        ends += _over_whole(plan, solver, structure, starts, ends)
+    if plan.lengthens:
+        better = _better_start(plan, structure, starts, ends)
+        if better is not None and plan.whole is not plan.segments:
+            ends += _over_whole(plan, solver, structure, better)
+        elif better is not None:
+            ends += _from_measured(plan, solver, structure, better)
     best = _lowest_end(ends)
     spent = {"iterations": sum(e.iterations for e in ends), "seconds": sum(e.seconds for e in ends)}
     return None if best is None else best._replace(**spent)
@@ -109,36 +114,56 @@ def _lengthen(
     return []
 
 
-def _over_whole(
+def _better_start(
     plan: SegmentedLagged,
-    solver: LevenbergMarquardt,
     structure: Structure,
     starts: Sequence[Vector],
     ends: Sequence[FreeRunFit],
-) -> list[FreeRunFit]:
-    """Return the end over whole experiments, where ends over segments are worse there.
+) -> Vector | None:
+    """Return the start whose run over whole experiments is better than those of all ends.
 
-    That is, where none is as good over whole experiments as every start.
+    None where an end is as good as every start.
     """
     places = [(end.mean_square, end.end.point.p) for end in ends]
     objective = plan.objective(structure)
     begun = [(plan.mean_square(objective.place(p)[1], np.zeros(0)), p) for p in starts]
     known = [place for place in (*places, *begun) if np.isfinite(place[0])]
     if not known:
-        return []
+        return None
     best = min(known, key=lambda place: place[0])
-    if any(np.array_equal(best[1], p) for _, p in places):
-        return []
+    return None if any(np.array_equal(best[1], p) for _, p in places) else best[1]
+
+
+def _over_whole(
+    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, start: Vector
+) -> list[FreeRunFit]:
+    """Return the end over whole experiments, where ends over segments are worse there."""
     whole = replace(plan.over(0), segments=plan.whole)
-    end = whole.descend(whole.objective(structure), best[1], solver)
+    end = whole.descend(whole.objective(structure), start, solver)
     if not end.ending.usable:
         return []
     # Its statistics are those of the plan's segments
-    own = plan.descend(objective, end.end.point.p, solver.at_most(0))
+    own = plan.descend(plan.objective(structure), end.end.point.p, solver.at_most(0))
     if not own.ending.usable:
         return []
     own = own._replace(end=own.end._replace(ending=end.ending, tail=end.end.tail))
     return [own._replace(iterations=end.iterations, seconds=end.seconds)]
+
+
+def _from_measured(
+    plan: SegmentedLagged, solver: LevenbergMarquardt, structure: Structure, start: Vector
+) -> list[FreeRunFit]:
+    """Return the end that is reached by way of runs from exactly the measured lags.
+
+    With estimated lags a mode that no input excites costs nothing, although the noise of measured
+    ones excites it and their run drifts. Runs from the measured ones lead past such an end.
+    """
+    exact = replace(plan, free_run=replace(plan.free_run, exact_start=True))
+    end = exact.descend(exact.objective(structure), start, solver.within_limit)
+    if not end.ending.usable:
+        return []
+    own = plan.descend(plan.objective(structure), end.end.point.p, solver)
+    return [own._replace(iterations=own.iterations + end.iterations)]
 
 
 def _lowest_end(ends: Sequence[FreeRunFit]) -> FreeRunFit | None:
@@ -272,6 +297,10 @@ class FreeRunTask(SimulationTask):
         return bool(np.isfinite(square)) and (
             self.physics is None or square <= self.physics.mean_square
         )
+
+    def conclude(self, structure: Structure, learned: TrainedLearner) -> LaggedEstimate:
+        """Return the estimate of what a run learned, on the rows of its problem."""
+        return replace(self.rows_task.conclude(structure, learned), criterion=self.criterion)
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return the median of several runs, with the error of its own free run."""

@@ -17,6 +17,8 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.fitting.segments import Sensitivity
 
+_UNSEEN = 1e-12  # of the largest curvature: a combination of states that no output shows
+
 
 class Start(NamedTuple):
     """Start states of a trial (k, n0, m), and their derivative by (c, w)."""
@@ -77,15 +79,26 @@ class InitialStates:
         missed = np.moveaxis(self.measured - values, -1, 1)
         try:
             return without_states(shared, own, missed, rows.T @ rows, np)
-        except (
-            np.linalg.LinAlgError
-        ):  # states that no output shows: no normal equations, and the trial is rejected
+        except np.linalg.LinAlgError:  # a combination of states that no output shows
+            pass
+        try:
+            return without_states(shared, own, missed, rows.T @ rows, np, _solve_shown)
+        except np.linalg.LinAlgError:  # no numbers: the trial is rejected
             nothing = np.full_like(shared[:-1, :-1], np.nan)
             return nothing, nothing[0], None, None
 
 
+def _solve_shown(inner: Any, right: Any) -> Any:
+    """Return the least solution of each block, which does not move what no output shows."""
+    size = np.sqrt(np.maximum(np.diagonal(inner, axis1=-2, axis2=-1), 0.0))
+    scale = 1 / np.where(size > 0, size, 1.0)
+    even = inner * scale[..., :, None] * scale[..., None, :]
+    inverse = np.linalg.pinv(even, rcond=_UNSEEN, hermitian=True)
+    return scale[..., None] * (inverse @ (scale[..., None] * right))
+
+
 def without_states(
-    shared: Any, own: Any, missed: Any, prior: Any, xp: Any
+    shared: Any, own: Any, missed: Any, prior: Any, xp: Any, solve: Any = None
 ) -> tuple[Any, Any, Any, Any]:
     """Return the normal equations of (c, w), and offset and slope of the states.
 
@@ -96,11 +109,13 @@ def without_states(
         missed: (…, n0), measured states less those that were run from.
         prior: (n0, n0), LᵀL.
         xp: NumPy, which raises where a block is singular, or JAX, which gives no finite numbers.
+        solve: of the blocks, where it is not that of `xp`.
     """
     n0, segments = own.shape[-2], tuple(range(own.ndim - 1))
     inner = own[..., :n0] + prior
     across, right = own[..., n0:-1], own[..., -1] + missed @ prior
-    solved = xp.linalg.solve(inner, xp.concatenate([across, right[..., None]], axis=-1))
+    solve = xp.linalg.solve if solve is None else solve
+    solved = solve(inner, xp.concatenate([across, right[..., None]], axis=-1))
     slope, offset = solved[..., :-1], solved[..., -1]
     hessian = shared[:-1, :-1] - xp.tensordot(across, slope, axes=(segments, segments))
     gradient = shared[:-1, -1] - xp.tensordot(across, offset, axes=(segments, segments))

@@ -136,6 +136,10 @@ class Task(Protocol):
         """Return the learner as a run left it."""
         ...
 
+    def conclude(self, structure: Structure, learned: TrainedLearner) -> Any:
+        """Return the estimate of what a run learned."""
+        ...
+
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return several members as one, the median of their predictions (`ensemble`)."""
         ...

@@ -16,10 +16,12 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
+from orthaug.fitting.conclusion import conclude_motion
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.field_points import sizes_learned
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
@@ -33,7 +35,7 @@ from orthaug.models.rows import Engine
 from orthaug.models.settling import LOOSE
 from orthaug.models.terms import scaling_of
 from orthaug.physics.motion import MOST_SUBSTEPS
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.problem import MotionProblem
 
 _SHORTEST = 15  # steps of a segment
 # Times, from one length of the segments to the next; every length compiles its own programs
@@ -61,7 +63,7 @@ def train_motion_physics(
     q, rows = initial, None
     for length in lengths:
         short = own.over(length)
-        end = _descend(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
+        end = descend_from(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
         if end is None:
             q, rows = initial, None
             continue
@@ -71,7 +73,7 @@ def train_motion_physics(
     for start, known in ((q, rows), (initial, None)):
         if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
-        end = _descend(own, solver, [start], known, progress)
+        end = descend_from(own, solver, [start], known, progress)
         if end is not None:
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
@@ -88,7 +90,7 @@ def train_motion_physics(
     return segmented, best._replace(mean_square=mean_square, iterations=iterations, seconds=seconds)
 
 
-def _descend(
+def descend_from(
     segmented: SegmentedMotion,
     solver: LevenbergMarquardt,
     starts: list[Vector],
@@ -277,6 +279,11 @@ class MotionTask(SimulationTask):
         return super().learned(
             run._replace(end=end._replace(linear=end.linear._replace(information=information)))
         )
+
+    def conclude(self, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
+        """Return the estimate of what a run learned."""
+        alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
+        return conclude_motion(self.plan, structure, learned, alone)
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress

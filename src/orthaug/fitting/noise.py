@@ -1,4 +1,4 @@
-"""Declarations of the errors' colour, for lagged physics trained one step ahead."""
+"""Declarations of the errors' colour: of lagged physics one step ahead, and of motions."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Any, Literal
 from orthaug._base.checks import check_count
 from orthaug._base.errors import InputError, show
 
-UNAVAILABLE = (
-    "is not available, because the gain of a predictor is not estimated yet; take auto, or arma "
-    "with the orders ar and ma"
+OF_MOTIONS = (
+    "is for motions, whose states follow a predictor; take auto, or arma with the orders ar and ma"
+)
+OF_LAGGED = (
+    "is for lagged physics one step ahead; take innovations, whose gain is estimated, auto or white"
 )
 
 Order = int | Literal["auto"]
@@ -61,7 +63,20 @@ class ARMA:
         return "auto" in (self.ar, self.ma)
 
 
-Noise = ARMA | Literal["white", "arma", "auto"]
+@dataclass(frozen=True)
+class Innovations:
+    """Declaration: process noise and sensor noise of a motion, by the gain K of its predictor.
+
+    The states follow `x̂_{k+1} = F(x̂_k, u_k) + K (y_k − h(x̂_k, u_k))`, and the criterion is the
+    prediction error `y − h(x̂)`. K is estimated with the parameters and the learner.
+
+    Examples:
+        >>> Innovations()
+        Innovations()
+    """
+
+
+Noise = ARMA | Innovations | Literal["white", "arma", "innovations", "auto"]
 
 
 def declared_noise(noise: Any) -> ARMA | None:
@@ -75,6 +90,23 @@ def declared_noise(noise: Any) -> ARMA | None:
     known: dict[str, ARMA | None] = {"white": None, "arma": ARMA(), "auto": ARMA("auto", "auto")}
     if isinstance(noise, str) and noise in known:
         return known[noise]
-    if noise == "innovations":
-        raise InputError(f"`noise` = innovations {UNAVAILABLE}.")
+    if isinstance(noise, Innovations) or noise == "innovations":
+        raise InputError(f"`noise` = innovations {OF_MOTIONS}.")
     raise InputError(f"`noise` must be white, arma, auto or ARMA(…); got {show(noise)}.")
+
+
+def noise_of_motion(noise: Any) -> Literal["white", "innovations", "auto"]:
+    """Return the noise model of a motion, by its word.
+
+    Raises:
+        InputError: what is no noise model, or one that motions do not have.
+    """
+    if isinstance(noise, Innovations):
+        return "innovations"
+    if isinstance(noise, ARMA) or noise == "arma":
+        raise InputError(f"`noise` = arma {OF_LAGGED}.")
+    if noise in ("white", "innovations", "auto"):
+        return noise
+    raise InputError(
+        f"`noise` must be white, innovations, auto or Innovations(); got {show(noise)}."
+    )

@@ -25,8 +25,8 @@ from orthaug._base.jax import training_clock
 from orthaug._base.progress import LOG
 from orthaug.fitting.colour import burg
 from orthaug.fitting.criteria import Criterion, Prediction
-from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.noise import ARMA
 from orthaug.fitting.output_noise import LAGS, LEVEL
 from orthaug.fitting.solvers.limit import Limit
@@ -79,9 +79,9 @@ def check_noise(
 def fit_coloured(
     problem: Problem,
     noise: ARMA,
-    fit: Callable[..., Estimate],
+    fit: Callable[..., LaggedEstimate],
     options: Mapping[str, Any],
-) -> Estimate:
+) -> LaggedEstimate:
     """Return the fit with a noise model; white where `noise` chooses none.
 
     Args:
@@ -153,7 +153,7 @@ class _Rows(NamedTuple):
     skip: int | None = None
 
     @classmethod
-    def of(cls, fit: Estimate) -> _Rows:
+    def of(cls, fit: LaggedEstimate) -> _Rows:
         problem, model, nt = fit.problem, fit.model, len(fit.theta)
         statistics = model.statistics
         assert statistics.gram is not None
@@ -209,12 +209,12 @@ class _Rows(NamedTuple):
         return np.split(values, np.cumsum(self.lengths)[:-1])
 
 
-def raw_errors(fit: Estimate) -> Matrix:
+def raw_errors(fit: LaggedEstimate) -> Matrix:
     """Return the errors v (N, ny) of the usable rows, before a noise model."""
     return replace(fit.model, noise=None).predict(fit.problem.record).errors
 
 
-def _free(fit: Estimate) -> Vector:
+def _free(fit: LaggedEstimate) -> Vector:
     """Return 0 for entries of θ at a bound, 1 for all other unknowns."""
     gram = fit.model.statistics.gram
     assert gram is not None
@@ -407,7 +407,7 @@ def _regress(rows: _Rows, long: _Found, orders: Orders) -> NoiseModel:
     return NoiseModel.of(orders, np.concatenate(values)).reflected()
 
 
-def _with_information(fit: Estimate) -> Estimate:
+def _with_information(fit: LaggedEstimate) -> LaggedEstimate:
     """Return a fit of filtered rows with statistics that count the coefficients as estimated."""
     problem, model, nt = fit.problem, fit.model, len(fit.theta)
     statistics, through = model.statistics, problem.noise
@@ -439,7 +439,7 @@ def _with_information(fit: Estimate) -> Estimate:
     return replace(fit, model=model, covariance=covariance)
 
 
-def _split_slope(fit: Estimate) -> Matrix:
+def _split_slope(fit: LaggedEstimate) -> Matrix:
     """Return ∂θ_aux/∂η (nθ, nη): the inner product that θ is split in depends on η."""
     problem, model, through = fit.problem, fit.model, fit.problem.noise
     assert through is not None

@@ -16,8 +16,10 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.checkpoints import Checkpoints
+from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Hold, OneStep, SummedOneStep, linearise
 from orthaug.fitting.paper_criterion import JointOneStep, PaperCriterion, Physics
@@ -36,11 +38,11 @@ from orthaug.physics.streamed import StreamedProblem
 
 MANY_ROWS, FEW_ROWS = 1_000_000, 200_000
 """From how many rows on runs begin where runs over few of them ended; the table is in
-docs/design.md.
+docs/decisions/many_rows.md.
 """
 OUTPUT_UNIT = 10.0
 """The learner's output unit in standard deviations of the baseline's residual: the table is in
-docs/design.md.
+docs/decisions/output_unit.md.
 """
 
 
@@ -353,6 +355,10 @@ class OneStepTask(TrainingRows):
             gram=change.T @ change,
             middle=lambda noise: self.middle(none, noise),
         )
+
+    def conclude(self, structure: Structure, learned: TrainedLearner) -> LaggedEstimate:
+        """Return the estimate of what a run learned."""
+        return conclude(self, structure, learned)
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:
         """Return the median `g = φ c̄ + median_i(f_i + φ (c_i − c̄))` of several runs (F2).

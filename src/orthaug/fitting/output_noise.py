@@ -9,6 +9,8 @@ import numpy as np
 from orthaug.fitting.whiteness import ljung_box
 from orthaug.inference.covariance import interval
 from orthaug.models.model import Model
+from orthaug.physics.innovations import InnovationsModel
+from orthaug.physics.noise import NoiseModel
 from orthaug.physics.problem import Problem
 
 LAGS, LEVEL = 25, 0.05  # of the innovations' whiteness: lags, and the level of the test
@@ -28,14 +30,17 @@ class Coefficient:
 class OutputNoise:
     """`D(q) v_k = C(q) e_k` of one output, D with `ar` coefficients and C with `ma`.
 
+    Of a motion in innovations form it has no orders: the coefficients are the output's column of
+    the predictor's gain K.
+
     `std` is that of the innovations e; `white_p` the probability that white ones are as correlated
     (Ljung-Box), None where they are too few.
     """
 
     output: str
     model: str
-    ar: int
-    ma: int
+    ar: int | None
+    ma: int | None
     coefficients: tuple[Coefficient, ...]
     std: float | None
     white_p: float | None
@@ -59,31 +64,50 @@ def noise_of(model: Model, problem: Problem) -> tuple[OutputNoise, ...]:
     if noise is None:
         return ()
     variances = model.statistics.noise
-    names = [output.name for output in model.outputs]
     std = None if noise.covariance is None else np.sqrt(np.diag(noise.covariance))
-    known = iter(enumerate(noise.names(names)))
-    runs = model.predict(problem.record).trajectories
+    free = noise.white and isinstance(noise, InnovationsModel)
+    runs = (model.simulate if free else model.predict)(problem.record).trajectories
     found = []
-    for o, ((p, q), output) in enumerate(zip(noise.orders, names, strict=True)):
+    for o, output in enumerate(channel.name for channel in model.outputs):
+        word, orders, past, places = _declared(noise, model, o)
         coefficients = []
-        for i, (_, name) in [next(known) for _ in range(p + q)]:
+        for i, name in places:
             value = float(noise.values[i])
             one = Coefficient(name, value)
             if std is not None:
                 low, high = interval(value, std[i], freedom)
                 one = Coefficient(name, value, float(std[i]), (float(low), float(high)))
             coefficients.append(one)
-        pieces = [run.errors[noise.past :, o] for run in runs]
-        box = ljung_box([piece for piece in pieces if len(piece)], LAGS, p + q)
+        pieces = [errors[~np.isnan(errors)] for errors in (run.errors[past:, o] for run in runs)]
+        box = ljung_box([piece for piece in pieces if len(piece)], LAGS, len(places))
         found.append(
             OutputNoise(
                 output,
-                noise.word(o),
-                p,
-                q,
+                word,
+                *orders,
                 tuple(coefficients),
                 None if variances is None else float(np.sqrt(variances[o, o])),
                 None if box is None else box.p,
             )
         )
     return tuple(found)
+
+
+def _declared(
+    noise: NoiseModel | InnovationsModel, model: Model, o: int
+) -> tuple[str, tuple[int | None, int | None], int, list[tuple[int, str]]]:
+    """Return of an output: word, orders, rows that are past only, places and names of values."""
+    names = [output.name for output in model.outputs]
+    if isinstance(noise, InnovationsModel):
+        places = [
+            (i * len(names) + o, f"K[{state}]") for i, state in enumerate(model.form.state_names)
+        ]
+        return (
+            ("white", (None, None), 0, [])
+            if noise.white
+            else ("innovations", (None, None), 0, places)
+        )
+    first = sum(map(sum, noise.orders[:o]))
+    count = sum(noise.orders[o])
+    own = enumerate(name for _, name in noise.names(names)[first : first + count])
+    return noise.word(o), noise.orders[o], noise.past, [(first + i, name) for i, name in own]

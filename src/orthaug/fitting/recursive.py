@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,8 +29,8 @@ from orthaug._base.jax import jax
 from orthaug._base.lines import percent
 from orthaug.data.record import Record
 from orthaug.fitting import recursive_storage
-from orthaug.fitting.any_fit import parameter_frame, parameter_lines
-from orthaug.fitting.estimates import Estimate, order_of
+from orthaug.fitting.estimates import parameter_frame, parameter_lines
+from orthaug.fitting.lagged_estimate import LaggedEstimate, order_of
 from orthaug.fitting.recursion import EstimateHistory, covariances
 from orthaug.fitting.recursive_rows import (
     RegressorStream,
@@ -57,7 +57,8 @@ QUIET = 1e6
 _LEAST_FACTOR = 0.3  # of forgetting: a memory of one row
 
 
-class Alarm(NamedTuple):
+@dataclass(frozen=True)
+class Alarm:
     """An alarm: residuals left their band at `row` of all rows, `time` [s] after the first."""
 
     row: int
@@ -100,7 +101,7 @@ class Recursive:
 
     def __init__(
         self,
-        fit: Estimate | Model,
+        fit: LaggedEstimate | Model,
         *,
         training: Record | None = None,
         forgetting: float | None = None,

@@ -16,7 +16,6 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import stack_rows
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.recursion import Recursion, inflation_of, squares, start_recursion
 from orthaug.fitting.residual_band import Reference
 from orthaug.inference.covariance import newey_west, whitening_matrix
@@ -215,14 +214,15 @@ def training_rows(fit: Any, training: Record | None) -> TrainingRowsModel:
     """
     check_type(
         fit,
-        Estimate | MotionEstimate | Model,
+        Estimate | Model,
         "fit",
         "what `estimate` returned, or a saved model",
     )
-    if not (fit if isinstance(fit, Model) else fit.model).form.separates:
+    saved = isinstance(fit, Model)
+    model, covariance = fit if saved else fit.model, None
+    if not model.form.separates:
         raise InputError(MOTION)
-    covariance = None
-    if isinstance(fit, Estimate):
+    if not saved:
         if fit.criterion.free_run is not None:
             raise InputError(
                 "the fit minimises the free run's error, but recursive least squares that of "
@@ -233,30 +233,27 @@ def training_rows(fit: Any, training: Record | None) -> TrainingRowsModel:
             raise InputError(
                 f"{names} at a bound: new rows would move them across it; fit without the bound."
             )
-        model, covariance, record = fit.model, fit.covariance, fit.problem.record
+        covariance, record = fit.covariance, fit.problem.record
+        freedom, robust = fit.freedom, fit.plain_covariance is not None
     else:
-        model = fit
         if training is None:
             raise InputError(
                 "a saved model does not contain its training data; give them, Recursive(model, "
                 "training=…)."
             )
         record = model.fitting(training, need_outputs=True)
+        freedom, robust = model.statistics.freedom, False
     if not len(model.theta):
         raise InputError("the physics has no parameter to estimate.")
     rows = stack_rows(record, model.form.layout)
     phi, target, _ = whitened_rows(model, rows.x, rows.y)
     lengths = tuple(len(experiment) - rows.start for experiment in record.experiments)
-    freedom = fit.freedom if isinstance(fit, Estimate) else model.statistics.freedom
     used = (
         target.size - len(model.theta) - freedom * target.shape[1] if np.isfinite(freedom) else 0.0
     )
-    robust = isinstance(fit, Estimate) and fit.plain_covariance is not None
     began = TrainingRowsModel(model, phi, target, lengths, covariance, max(used, 0.0), robust)
     _check_solved(began)
-    return (
-        began if isinstance(fit, Estimate) else began._replace(covariance=_saved_covariance(began))
-    )
+    return began._replace(covariance=_saved_covariance(began)) if saved else began
 
 
 def _check_solved(began: TrainingRowsModel) -> None:

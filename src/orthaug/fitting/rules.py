@@ -120,7 +120,7 @@ def choose_regularizations(
 ) -> tuple[Any, ...]:
     """Return the regularizations of every start: those given, or those of "auto".
 
-    docs/design.md has the table.
+    docs/decisions/regularization.md has the table.
 
     Args:
         linear: whether the physics is linear in θ, which is then solved.

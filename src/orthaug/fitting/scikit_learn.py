@@ -15,8 +15,8 @@ from orthaug._base.jax import jax
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, Layout
-from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.models.learners import MLP
@@ -106,7 +106,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
             )
         if not fit.status.ok:
             raise TrainingError(fit.status.message)
-        self.estimate_: Estimate = fit
+        self.estimate_: LaggedEstimate = fit
         self.theta_ = fit.theta
         self.theta_interval_ = fit.interval
 
@@ -146,7 +146,7 @@ class Augmented(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Return values (n, n_outputs) with as many axes as y had."""
         return values[:, 0] if self._one_column else values
 
-    def _fitted_estimate(self) -> Estimate:
+    def _fitted_estimate(self) -> LaggedEstimate:
         """Return the estimate; NotFittedError where there is none."""
         from sklearn.utils.validation import check_is_fitted
 

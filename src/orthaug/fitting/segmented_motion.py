@@ -22,10 +22,12 @@ from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
 from orthaug.models.moving import MotionDynamics
+from orthaug.models.predictor import dynamics_of, predictor_of
 from orthaug.models.settling import LOOSE, Windows, settle
 from orthaug.models.starts import FIRST_ROWS
+from orthaug.physics.innovations import InnovationsModel
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.problem import MotionProblem
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,6 +51,8 @@ class SegmentedMotion(SegmentedProblem):
     dynamics: MotionDynamics
     problem: MotionProblem
     loose: Vector
+    predictor: InnovationsModel | None = None
+    """The noise model whose gain is given to a predictor; None for other dynamics."""
 
     @classmethod
     def of(
@@ -58,6 +62,7 @@ class SegmentedMotion(SegmentedProblem):
         criterion: Criterion,
         like: SegmentedMotion | None = None,
         sums: SegmentSums | None = None,
+        predictor: InnovationsModel | None = None,
     ) -> SegmentedMotion:
         """Lay out a record as a criterion declares, for a motion and a learner of unit scaling.
 
@@ -70,7 +75,8 @@ class SegmentedMotion(SegmentedProblem):
         assert free_run is not None, "a motion has no criterion one step ahead"
         features = problem.features[: bound.nz]  # none without a learner
         substeps = problem.substeps if like is None else like.dynamics.substeps
-        dynamics = MotionDynamics(problem.motion, features, bound, record.sampling_time, substeps)
+        dynamics = dynamics_of(problem.motion, features, bound, record.sampling_time, substeps)
+        dynamics = dynamics if predictor is None else predictor_of(dynamics)
         shares = 1 if sums is None else sums.engine.shares
         return cls(
             record=record,
@@ -86,6 +92,13 @@ class SegmentedMotion(SegmentedProblem):
             sums=sums,
             problem=problem,
             loose=LOOSE * sizes(problem),
+            predictor=predictor,
+        )
+
+    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+        numbers = super().numbers(c, w, tilt)
+        return (
+            numbers if self.predictor is None else numbers._replace(correction=self.predictor.gain)
         )
 
     @property
@@ -224,7 +237,8 @@ class SegmentedMotion(SegmentedProblem):
         runs = self.runs(c, w, states)
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
-        return np.moveaxis(runs, -1, 1)[scored], self.dynamics.now(inputs)
+        states = np.moveaxis(runs, -1, 1)[scored]
+        return states, self.dynamics.at_samples(self.numbers(c, w), states, inputs)
 
     @property
     def _washout(self) -> int:

@@ -17,8 +17,7 @@ from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
-from orthaug.fitting.any_fit import Restart
-from orthaug.fitting.conclusion import conclude
+from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
@@ -29,6 +28,7 @@ from orthaug.fitting.held_out import (
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.setup import FOLD_ITERATIONS
 from orthaug.fitting.silence import add_retries, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -36,11 +36,23 @@ from orthaug.models.learners import Bound
 
 # of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
 _INFLATION = 1.4
-FOLD_ITERATIONS = 60  # enough to see whether a learner helps, on every block of cross-validation
+# rows · parameters · iterations of free runs on one block: about 2 s on one core
+_FOLD_WORK = 2.5e7
 
 
-Concluding = Callable[[Any, Structure, TrainedLearner], Any]
-"""Makes the estimate of a task, a structure and what a run learned."""
+def fold_solver(solver: Solver, rows: int, parameters: int, *, free_run: bool) -> Solver:
+    """Return the solver for the fit to a block of cross-validation.
+
+    A free run begins at physics alone and may need more iterations than one step ahead until its
+    learner is worth judging; small problems get them, up to the solver's own limit.
+
+    Args:
+        rows: training rows of the block.
+        parameters: of physics and learner together.
+        free_run: whether the fit is to the free run.
+    """
+    affordable = int(_FOLD_WORK / max(rows * parameters, 1)) if free_run else 0
+    return solver.at_most(max(FOLD_ITERATIONS, affordable))
 
 
 class PlannedRun(NamedTuple):
@@ -112,14 +124,12 @@ def train(
     solver: Solver,
     choice: Choice,
     progress: ProgressCallback,
-    conclude: Concluding = conclude,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> Any:
     """Run from every start and conclude with the best.
 
     Args:
         runner: makes the runs, and those on held-out blocks; an `Engine`, or `Threads()`.
-        conclude: makes the estimate of a task, a structure and what a run learned.
     """
     with one_blas_thread():
         task = task.prepare(solver, structure, partial(progress, 0))
@@ -129,14 +139,14 @@ def train(
         _run_all(task, starts, structure, solver, choice, progress, runner),
     )
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: _conclude(conclude, task, structure, task.learned(runs[i])))
+    concluded = cache(lambda i: task.conclude(structure, task.learned(runs[i])))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
     untried = bool(
         stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
     )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
-    held_out = _held_out(task, starts, concluded, structure, solver, choice, conclude, runner)
+    held_out = _held_out(task, starts, concluded, structure, solver, choice, runner)
     errors = (
         [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     )
@@ -159,10 +169,10 @@ def train(
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
-        estimate = _conclude_physics(conclude, task, structure)
+        estimate = _conclude_physics(task, structure)
     elif choice.ensemble:
         members = alike
-        estimate = _conclude(conclude, task, structure, _median(task, runs, members, best))
+        estimate = task.conclude(structure, _median(task, runs, members, best))
     else:
         estimate = concluded(best)
     scored = choice.scored and held_out is None
@@ -179,22 +189,21 @@ def train(
         *replacing,
         *retry_warnings(planned, starts, runs, held_out, best),
     )
-    beside = _physics_to_compare(conclude, task, structure) if best >= 0 else None
+    beside = _physics_to_compare(task, structure) if best >= 0 else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
     return replace(estimate, **found, warnings=warnings)
 
 
-def _physics_to_compare(conclude: Concluding, task: Task, structure: Structure) -> Any:
+def _physics_to_compare(task: Task, structure: Structure) -> Any:
     """Return the estimate of physics alone, to compare with that of a learner.
 
-    None without one, and where it costs a pass.
+    It is least squares one step ahead, also where θ has a penalty. None without a learner, and
+    where it costs a pass.
     """
-    streamed = hasattr(task.problem, "source")
-    return (
-        None
-        if not task.bound.learns or streamed
-        else _physics_for_comparison(conclude, task, structure)
-    )
+    if not task.bound.learns or hasattr(task.problem, "source"):
+        return None
+    plain = task.criterion.one_step and not structure.projects
+    return _conclude_physics(task, Orthogonal() if plain else structure)
 
 
 def _restart(
@@ -218,7 +227,7 @@ def _cross_validation(task: Task, run: Any) -> float:
     Infinite where it uses up all rows.
     """
     samples = task.problem.samples
-    left = samples - len(task.problem.baseline.names) - _INFLATION * run.effective
+    left = samples - len(task.problem.names) - _INFLATION * run.effective
     return task.loss(run) * (samples / left) ** 2 if left > 0 else math.inf
 
 
@@ -324,7 +333,6 @@ def _held_out(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    conclude: Concluding,
     runner: Any,
 ) -> HeldOutErrors | None:
     """Return held-out errors: of runs on the validation record, or of runs on folds.
@@ -334,7 +342,7 @@ def _held_out(
     if choice.validation is not None:
         record, unit = choice.validation, task.problem.deviation
         fits = [concluded(i) for i in range(len(starts))]
-        alone = _errors(_conclude_physics(conclude, task, structure), record, unit)
+        alone = _errors(_conclude_physics(task, structure), record, unit)
         labels = ("the validation part",) * len(record.experiments)
         return HeldOutErrors(
             "the validation part", labels, alone, tuple(_errors(fit, record, unit) for fit in fits)
@@ -349,7 +357,7 @@ def _held_out(
         )
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
-    given = (task, starts, structure, solver.at_most(FOLD_ITERATIONS), conclude)
+    given = (task, starts, structure, solver)
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(
@@ -364,16 +372,22 @@ def _held_out(
 
 def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
     """Return errors on a block of physics alone, and of runs from every start on the rest."""
-    task, starts, structure, solver, conclude = given
+    task, starts, structure, solver = given
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
+    solver = fold_solver(
+        solver,
+        sum(map(len, training.experiments)),
+        len(task.problem.names) + task.bound.size,
+        free_run=not task.criterion.one_step,
+    )
     try:
         own = task.on(training).prepare(solver, structure)
-        fits = [_conclude_physics(conclude, own, structure)]
+        fits = [_conclude_physics(own, structure)]
         for start in starts:
             report()
             run = own.run(solver, start.weights, structure, start.regularization)
-            fits.append(_conclude(conclude, own, structure, own.learned(run)))
+            fits.append(own.conclude(structure, own.learned(run)))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
@@ -383,7 +397,9 @@ def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
     """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
-    return squared_errors(fit.criterion.response(fit.model, record), unit)
+    ahead = fit.model.coloured  # the criterion of a noise model is one step ahead
+    response = fit.model.predict(record) if ahead else fit.criterion.response(fit.model, record)
+    return squared_errors(response, unit)
 
 
 def _fell_back(held_out: HeldOutErrors) -> Warning:
@@ -403,24 +419,9 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _conclude_physics(conclude: Concluding, task: Task, structure: Structure) -> Any:
+def _conclude_physics(task: Task, structure: Structure) -> Any:
     rows, learned = task.physics_alone()
-    return replace(conclude(rows, structure, learned), criterion=task.criterion)
-
-
-def _physics_for_comparison(conclude: Concluding, task: Task, structure: Structure) -> Any:
-    """Return physics alone for comparison with a learner.
-
-    It is least squares one step ahead, also where θ has a penalty.
-    """
-    plain = task.criterion.one_step and not structure.projects
-    return _conclude_physics(conclude, task, Orthogonal() if plain else structure)
-
-
-def _conclude(
-    conclude: Concluding, task: Task, structure: Structure, learned: TrainedLearner
-) -> Any:
-    return replace(conclude(task.rows_task, structure, learned), criterion=task.criterion)
+    return replace(rows.conclude(structure, learned), criterion=task.criterion)
 
 
 def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:

@@ -23,7 +23,7 @@ from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.rows import Engine
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_problem import MotionProblem
+from orthaug.physics.problem import MotionProblem
 
 _SETTLING = 200  # iterations of the starts, which no step of the descent damps
 

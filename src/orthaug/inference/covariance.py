@@ -35,7 +35,7 @@ from orthaug.models.rows import (
     projected_gram,
 )
 from orthaug.models.statistics import column_units, half_inverse
-from orthaug.physics.noise import RowFilter
+from orthaug.physics.noise import NoiseModel, RowFilter
 from orthaug.physics.problem import Problem
 from orthaug.physics.projection import Factor
 
@@ -220,7 +220,7 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
         x = model.form.regressors(experiment, record)
         shape = chunk_shape(len(x))
         chunks = in_chunks(x, shape, repeat=True)
-        if model.coloured and model.noise is not None:
+        if model.coloured and isinstance(model.noise, NoiseModel):
             moved = from_chunks(
                 np.asarray(changes(model.form, model.numbers, chunks, root)), len(x)
             )

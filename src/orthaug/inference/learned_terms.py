@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError
+from orthaug._base.lines import INTERVAL_HEAD, estimate_rows, table
 from orthaug.data.expressions import Expression
 from orthaug.data.terms import outside_brackets
 from orthaug.data.writing import coefficient_unit, latex
@@ -208,9 +209,11 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
     """Return a table with a row per term; NaN where there is no interval."""
     import pandas as pd
 
+    from orthaug._base.frames import EstimateFrame
+
     nothing = (np.nan, np.nan)
     ci = np.array([term.ci95 or nothing for term in terms]).reshape(-1, 2)
-    return pd.DataFrame(
+    return EstimateFrame(
         {
             "added_to": [term.added_to for term in terms],
             "unit": [term.unit for term in terms],
@@ -224,27 +227,18 @@ def term_frame(terms: Sequence[LearnedTerm]) -> pd.DataFrame:
     )
 
 
-def term_lines(terms: Sequence[LearnedTerm]) -> list[str]:
+def term_lines(terms: Sequence[LearnedTerm], interval_head: str = INTERVAL_HEAD) -> list[str]:
     """Return the terms as a table in text, with a heading.
 
     A dash where there is no interval.
     """
     if not terms:
         return []
-    width = max(4, *(len(term.term) for term in terms))
+    cells = estimate_rows((term.coefficient, term.std, term.ci95) for term in terms)
     several = len({term.added_to for term in terms}) > 1
-    lines = [
-        "",
-        f"{'term':<{width}}  {'coefficient':>14}  {'std':>11}  {'95 % interval':^29}  "
-        f"{'largest':>11}  unit",
+    head = ["term", "coefficient", "std", interval_head, "largest", "unit"]
+    rows = [
+        [term.term, *own, f"{term.largest:.5g}", term.unit or "", *[term.added_to] * several]
+        for term, own in zip(terms, cells, strict=True)
     ]
-    for term in terms:
-        spread, reach = f"{'–':>11}", f"{'–':^29}"
-        if term.std is not None and term.ci95 is not None:
-            spread, reach = f"{term.std:11.4g}", f"[{term.ci95[0]:13.7g}, {term.ci95[1]:13.7g}]"
-        row = (
-            f"{term.term:<{width}}  {term.coefficient:14.8g}  {spread}  {reach}  "
-            f"{term.largest:11.5g}  "
-        )
-        lines.append(f"{row}{term.unit or ''}{f'  in {term.added_to}' * several}".rstrip())
-    return lines
+    return ["", *table([[*head, *["added to"] * several], *rows], drop=["unit", "largest"])]

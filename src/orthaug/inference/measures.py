@@ -25,8 +25,8 @@ from orthaug.data.record import Channel, Experiment, Record
 from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation
+from orthaug.physics.guessed_motion import layout_of
 from orthaug.physics.motion import Motion
-from orthaug.physics.motion_problem import layout_of
 from orthaug.physics.noise import NoiseModel, RowFilter
 from orthaug.physics.output_weights import times
 from orthaug.physics.problem import Problem

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy.special
@@ -32,7 +31,8 @@ _SOLVED = {
 }  # ‖residual‖² that counts as none: in variances of θ̂; without them relative to θ̂²
 
 
-class Consistency(NamedTuple):
+@dataclass(frozen=True)
+class Consistency:
     """Test of θ̂ against the relations that the physics imposes on θ.
 
     χ² = rᵀCov⁻¹r, its degrees of freedom, its p-value, and a sentence.

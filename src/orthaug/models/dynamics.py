@@ -50,6 +50,8 @@ class Numbers(NamedTuple):
     """(n, nz), by which the regressor, or states and inputs, follow the features onto that range
     (`models.beyond`).
     """
+    correction: Any = None
+    """(nx, ny), the gain of a predictor (`models.predictor`); None for other dynamics."""
 
     @property
     def free(self) -> Numbers:
@@ -127,6 +129,11 @@ class Dynamics(Protocol):
         ...
 
     @property
+    def steps_unevenly(self) -> bool:
+        """Whether a step may take another time than `sampling_time`, as between uneven instants."""
+        ...
+
+    @property
     def separates(self) -> bool:
         """True if a step gives its output in the parts of physics and learner.
 
@@ -145,6 +152,11 @@ class Dynamics(Protocol):
     @property
     def differentiable(self) -> bool:
         """True if JAX can differentiate `step`; otherwise finite differences are used."""
+        ...
+
+    @property
+    def calls_host(self) -> bool:
+        """True if a step leaves the compiled program, so that each call counts."""
         ...
 
     @property
@@ -195,8 +207,15 @@ class Dynamics(Protocol):
         """
         ...
 
+    def at_samples(self, numbers: Numbers, states: Matrix, inputs: Matrix) -> Matrix:
+        """Return what the learner's features read beside the states, from the inputs of steps.
+
+        Of a motion these are its inputs at the samples, with those that a controller sets.
+        """
+        ...
+
     def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
-        """Return the learner's features (T, nz) at states (T, n0) and rows of inputs (T, nu)."""
+        """Return the learner's features (T, nz) at states (T, n0) and inputs of `at_samples`."""
         ...
 
     @property
@@ -285,7 +304,9 @@ class AutodiffDynamics:
     coordinates: Any = Coordinates(())
     entries: tuple[Expression, ...] = ()
     separates = False
+    steps_unevenly = False
     differentiable = True
+    calls_host = False
 
     def prepare(self, numbers: Numbers) -> Numbers:
         return numbers
@@ -307,6 +328,9 @@ class AutodiffDynamics:
     @property
     def state_names(self: Any) -> tuple[str, ...]:
         return tuple(f"x{i + 1}" for i in range(self.states))
+
+    def at_samples(self, numbers: Numbers, states: Matrix, inputs: Matrix) -> Matrix:
+        return inputs
 
     def features_at(self, states: Matrix, inputs: Matrix) -> Matrix:
         return np.zeros((len(states), 0))
@@ -359,12 +383,14 @@ class AutodiffDynamics:
         return self.local(numbers, state, inputs).along(slopes)
 
 
-def free_run(form: Dynamics, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+def free_run(
+    form: Dynamics, numbers: Numbers, start: Vector, inputs: Matrix, batch: int = BATCH
+) -> Run:
     """Return the free run from a state along rows of inputs (T, nu), a batch of them at a time."""
     state, pieces = start, []
-    for begin in range(0, len(inputs), BATCH):
-        rows = inputs[begin : begin + BATCH]
-        padded = np.pad(rows, ((0, BATCH - len(rows)), (0, 0)), mode="edge")
+    for begin in range(0, len(inputs), batch):
+        rows = inputs[begin : begin + batch]
+        padded = np.pad(rows, ((0, batch - len(rows)), (0, 0)), mode="edge")
         state, run = _scan(form, numbers, state, padded)
         pieces.append([np.asarray(part)[: len(rows)] for part in (run.states, *run.parts)])
     states, *parts = (np.concatenate(piece) for piece in zip(*pieces, strict=True))

@@ -186,11 +186,13 @@ class MotionFilter:
     def unit(self, noise: Matrix, size: Vector) -> Matrix:
         """Return a disturbance (nx, nx) as large as the states.
 
-        None where a rate is another state: that is exact.
+        None where a rate is another state, or in a controller: that is exact.
         """
+        motion, names = self.form.motion, self.names
         known = [
-            state.derivative in self.names and not state.learned
-            for state in self.form.motion.states
+            state.name in motion.discrete_states
+            or (state.derivative in names and not state.learned)
+            for state in motion.states
         ]
         return np.diag(np.where(known, 0.0, size**2))
 
@@ -201,7 +203,7 @@ class MotionFilter:
         """
         n = self.form.states
         nothing = Experiment(
-            np.zeros((4, len(self.form.motion.inputs))), np.zeros((4, len(self.form.outputs)))
+            np.zeros((4, len(self.form.motion.external))), np.zeros((4, len(self.form.outputs)))
         )
         inputs = np.zeros(self.form.inputs(nothing, None).shape[1])  # type: ignore[arg-type]
         return (

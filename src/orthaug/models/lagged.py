@@ -59,6 +59,8 @@ class LaggedDynamics:
         return Coordinates(self.baseline.parameters, logarithms=False)
 
     separates = True
+    steps_unevenly = False
+    calls_host = False
 
     @property
     def linear(self) -> bool:
@@ -134,6 +136,9 @@ class LaggedDynamics:
     ) -> Float[np.ndarray, "r n0"]:
         """Return the run's own past outputs, so that no step is computed again."""
         return self.start(outputs, rows)
+
+    def at_samples(self, numbers: Numbers, states: Matrix, inputs: Matrix) -> Matrix:
+        return inputs
 
     def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
         x = self.regressor(states.T, inputs.T, np).T

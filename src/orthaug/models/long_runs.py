@@ -15,7 +15,7 @@ from orthaug.models.dynamics import Run
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
 from orthaug.models.response import Response, Scores, scores_of
-from orthaug.physics.problem import Moments
+from orthaug.physics.moments import Moments
 
 
 class RunPiece(NamedTuple):

@@ -22,11 +22,13 @@ from orthaug.models.dynamics import Numbers, Parts, Run
 from orthaug.models.kalman import Filter
 from orthaug.models.learners import Scaling
 from orthaug.models.on_records import RUNAWAY, Form, RecordModel, trajectory
+from orthaug.models.open_loop import plant_of
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.starts import PastOutputs, Starts
 from orthaug.models.statistics import Statistics
 from orthaug.models.stepping import one_experiment, step_arguments
 from orthaug.physics.baseline import Parameter
+from orthaug.physics.innovations import InnovationsModel
 from orthaug.physics.noise import NoiseModel
 from orthaug.physics.parameters import PhysicalParameter
 
@@ -91,7 +93,7 @@ class Model(RecordModel[Form], NotebookView):
     """Directions of θ (nθ, s) along which a split makes the learner orthogonal; None for all."""
     time_column: str | None = None
     statistics: Statistics = Statistics()  # noqa: RUF009  (frozen)
-    noise: NoiseModel | None = field(default=None, kw_only=True)
+    noise: NoiseModel | InnovationsModel | None = field(default=None, kw_only=True)
     """The model of the errors' colour, for predictions; None where nobody asked for one."""
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
@@ -250,7 +252,8 @@ class Model(RecordModel[Form], NotebookView):
         if not self.form.has_range:
             return found
         with np.errstate(all="ignore"):
-            outside = self.beyond(self.form.features_at(run.states, inputs))
+            read = self.form.at_samples(self.numbers, run.states, inputs)
+            outside = self.beyond(self.form.features_at(run.states, read))
         return replace(
             found, outside=np.concatenate([np.zeros(self.form.first_row, dtype=bool), outside])
         )
@@ -268,7 +271,7 @@ class Model(RecordModel[Form], NotebookView):
         for experiment in record.experiments:
             run, inputs = self.free_run(experiment, record, initial)
             rows = self.form.first_row + np.arange(len(run.states))
-            columns = {"time": experiment.start_time + rows * self.sampling_time}
+            columns = {"time": experiment.instants(self.sampling_time)[rows]}
             columns |= dict(zip(self.form.state_names, run.states.T, strict=True))
             for name, physics, learner in self.form.learned_along(self.numbers, run, inputs):
                 columns |= {f"{name}_physics": physics, f"{name}_learner": learner}
@@ -284,6 +287,15 @@ class Model(RecordModel[Form], NotebookView):
     def filtering(self) -> tuple[Filter, Numbers, Vector]:
         """The model as a filter: its dynamics, its numbers, and the size of an unknown state."""
         return self.starts.filtering(self)
+
+    @property
+    def plant(self: Model[Any]) -> Model[Any]:
+        """The model without the controller around it, its inputs given from outside.
+
+        Of a model without a controller it is the model itself. It keeps no statistics.
+        """
+        loop = getattr(self.form, "motion", None)
+        return self if loop is None or not loop.held else plant_of(self)
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from orthaug.data.expressions import Expression
 from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
+from orthaug.physics.integrators import split_pace
 from orthaug.physics.motion import Motion
 
 
@@ -57,8 +58,25 @@ class MotionField:
         return len(self.motion.parameters) + self.bound.size
 
     def now(self, inputs: Any) -> Any:
-        """Return u (…, nu) at the sample itself, of the rows that steps read."""
-        return inputs[..., : len(self.motion.inputs)]
+        """Return the record's inputs (…, external) at the sample, of the rows that steps read."""
+        return inputs[..., : len(self.motion.external)]
+
+    def split_pace(self, row: Any) -> tuple[Any, Any]:
+        """Return what a step reads of the inputs, and its length over the sampling time."""
+        return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
+
+    def external(self, u: Any) -> Any:
+        """Return the record's inputs (external,) of all inputs u (nu,) at a point."""
+        return u[len(self.motion.held) :]
+
+    def inputs_at(self, numbers: Numbers, x: Any, row: Any) -> Any:
+        """Return all inputs u (nu,) of a sample, those of a controller first, at one point."""
+        motion, given = self.motion, self.now(row)
+        if not motion.held:
+            return given
+        y = self.observed(numbers, x, jnp.concatenate([jnp.zeros(len(motion.held)), given]))
+        control = motion.control(y, x, given, self.parameters(numbers), jnp)
+        return jnp.concatenate([control, given])
 
     def seen(self, x: Any, u: Any, xp: Any = jnp) -> Any:
         """Return the learner's features z (nz, …) of states (nx, …) and inputs (nu, …)."""
@@ -146,6 +164,24 @@ class MotionField:
         p, rest = self.parameters(numbers), jnp.zeros(len(self.motion.inputs))
         slope = jax.jacfwd(lambda x: self.motion.rates(x, rest, p, jnp))(jnp.zeros(self.states))
         return jnp.where(jnp.isfinite(slope), slope, 0.0)
+
+
+def inputs_along(
+    form: MotionField, numbers: Numbers, x: Matrix, rows: Matrix
+) -> Float[np.ndarray, "M nu"]:
+    """Return all inputs at states (M, nx), from the rows (M, …) that steps read there."""
+    if not form.motion.held:
+        return np.asarray(form.now(rows))
+    count = len(x)
+    x, rows = (
+        np.pad(part, ((0, padded_length(count) - count), (0, 0)), mode="edge") for part in (x, rows)
+    )
+    return np.asarray(_inputs(form, numbers, x, rows))[:count]
+
+
+@partial(jax.jit, static_argnames="form")
+def _inputs(form: MotionField, numbers: Numbers, x: Any, rows: Any) -> Float[Array, "m nu"]:
+    return jax.vmap(lambda x, row: form.inputs_at(numbers, x, row))(x, rows)
 
 
 def parts_at(form: MotionField, numbers: Numbers, x: Matrix, u: Matrix) -> tuple[Matrix, Matrix]:

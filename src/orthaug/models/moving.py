@@ -14,9 +14,18 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.models.dynamics import AutodiffDynamics, Local, Numbers, Parts, Run
+from orthaug.models.dynamics import (
+    BATCH,
+    AutodiffDynamics,
+    Local,
+    Numbers,
+    Parts,
+    Run,
+    free_run,
+)
 from orthaug.models.learners import nothing_learned
-from orthaug.models.motion_field import MotionField, parts_at
+from orthaug.models.motion_field import MotionField, inputs_along, parts_at
+from orthaug.physics.guessed_motion import guess, layout_of
 from orthaug.physics.integrators import (
     UNROLLED,
     Exponentials,
@@ -24,7 +33,7 @@ from orthaug.physics.integrators import (
     input_at,
     inputs_at_points,
 )
-from orthaug.physics.motion_problem import guess, layout_of
+from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import Coordinates
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
@@ -41,8 +50,9 @@ class Slopes(NamedTuple):
 
 def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> Slopes:
     """Return x one sample later with its slopes, at one state (nx,) and input row, under `rk4`."""
+    row, pace = form.split_pace(row)
     at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
-    h, identity = form.sampling_time / form.substeps, jnp.eye(form.states)
+    h, identity = pace * form.sampling_time / form.substeps, jnp.eye(form.states)
     through, x = [], state
     for j in range(form.substeps):
         u = [at(2 * j + i, halves) for i in range(3)]
@@ -80,7 +90,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     def physics(x: Any, c: Any) -> Any:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiate(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c, form.motion)
     to_x, to_c = _finite(to_x), _finite(to_c)
     states, _ = form.corrected
     if not states:
@@ -119,7 +129,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
-    value, to_x, to_c = _differentiate(physics, x, c)
+    value, to_x, to_c = _differentiate(physics, x, c, form.motion)
     to_w = jnp.zeros((len(value), form.unknowns - len(c)))
     states, outputs = form.corrected
     if outputs:
@@ -130,11 +140,20 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
 
 
-def _differentiate(function: Any, x: Any, c: Any) -> tuple[Any, Any, Any]:
+def _differentiate(function: Any, x: Any, c: Any, motion: Motion) -> tuple[Any, Any, Any]:
     """Return the value and its slopes by x and c.
 
-    Few entries are differentiated one at a time, without what an entry does not touch.
+    Few entries are differentiated one at a time, without what an entry does not touch. A source
+    has all slopes at once.
     """
+    if motion.source is not None:
+
+        def twice(x: Any, c: Any) -> tuple[Any, Any]:
+            value = function(x, c)
+            return value, value
+
+        (to_x, to_c), value = jax.jacfwd(twice, (0, 1), has_aux=True)(x, c)
+        return value, to_x, to_c
     entries, n0 = [*x, *c], len(x)
     if len(entries) > _FEW:
         return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
@@ -155,6 +174,7 @@ def _finite(slope: Any) -> Any:
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
+_FEWER = 128  # rows per compiled call, where each calls the host
 _LARGE = 150
 # operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
@@ -165,6 +185,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     linear = False
     separates = False
+    steps_unevenly = True
     first_row = 0
     memory = 0
 
@@ -192,6 +213,11 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return layout_of(self.motion)
 
     @property
+    def plain(self) -> MotionDynamics:
+        """These dynamics as a free run, which no measured output corrects."""
+        return self
+
+    @property
     def physics_only(self) -> MotionDynamics:
         """These dynamics without the learner."""
         return replace(self, features=(), bound=nothing_learned())
@@ -210,28 +236,47 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return np.zeros((self.states, self.states))
 
     def inputs(self, experiment: Experiment, record: Record) -> Matrix:
-        return inputs_at_points(np.asarray(experiment.inputs), self.motion.hold, self.substeps)
+        inputs, motion = np.asarray(experiment.inputs), self.motion
+        if record is None or record.even:
+            return inputs_at_points(inputs, motion.hold, self.substeps)
+        motion.check_paced(record)
+        if experiment.steps is None:
+            record.check_even("this analysis")
+        steps = np.asarray(experiment.steps)
+        return inputs_at_points(inputs, motion.hold, self.substeps, steps / self.sampling_time)
+
+    def at_samples(self, numbers: Numbers, states: Matrix, inputs: Matrix) -> Matrix:
+        return inputs_along(self, numbers, states, inputs)
 
     def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
-        return np.asarray(self.seen(states.T, self.now(inputs).T, np)).T
+        return np.asarray(self.seen(states.T, inputs.T, np)).T
 
     @property
     def state_names(self) -> tuple[str, ...]:
         return self.motion.names_of_states
 
+    @property
+    def calls_host(self) -> bool:
+        source = self.motion.source
+        return source is not None and not source.compiled
+
+    def run(self, numbers: Numbers, start: Vector, inputs: Matrix) -> Run:
+        return free_run(self, numbers, start, inputs, _FEWER if self.calls_host else BATCH)
+
     def learned_along(
         self, numbers: Numbers, run: Run, inputs: Matrix
     ) -> Iterator[tuple[str, Vector, Vector]]:
         """Yield the rates of learned equations, and learned outputs."""
-        parts = parts_at(self, numbers, run.states, self.now(inputs))
+        points = self.at_samples(numbers, run.states, inputs)
+        parts = parts_at(self, numbers, run.states, points)
         states, outputs = self.motion.learned
         names = [self.state_names[i] for i in states] + [self.outputs[i] for i in outputs]
         yield from zip(names, *(part.T for part in parts), strict=True)
 
     def describe(self, state: Vector, inputs: Vector) -> dict[str, float]:
-        """Return states and inputs by name."""
+        """Return states and the record's inputs by name."""
         named = zip(
-            (*self.motion.names_of_states, *self.motion.inputs),
+            (*self.motion.names_of_states, *self.motion.external),
             (*state, *self.now(inputs)),
             strict=True,
         )
@@ -241,17 +286,29 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return _step(self, numbers, state, inputs)
 
     def _step_once(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
-        y = self.observed(numbers, state, self.now(inputs))
-        parts = Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
-        if self.motion.scheme.discrete:
-            return sum(self.rates(numbers, state, self.now(inputs))), parts
+        motion, now = self.motion, self.inputs_at(numbers, state, inputs)
+        y = self.observed(numbers, state, now)
+        following = self._to_next_sample(numbers, state, now, inputs)
+        if motion.discrete_states:
+            p = self.parameters(numbers)
+            following = motion.after_sample(following, y, state, now, p, jnp)
+        return following, Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
 
+    def _to_next_sample(self, numbers: Numbers, state: Any, now: Any, inputs: Any) -> Any:
+        """Return the states one sample later, with what a controller sets held until then."""
+        if self.motion.scheme.discrete:
+            return sum(self.rates(numbers, state, now))
         exponentials = self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0]
-        h, large = self.sampling_time / self.substeps, self._large
+        inputs, pace = self.split_pace(inputs)
+        h, large = pace * self.sampling_time / self.substeps, self._large
         field = partial(_field, self, numbers)
         step = self.motion.scheme.step(field, h, exponentials, looped=large)
-        nu = len(self.motion.inputs)
-        return advance(step, state, inputs, nu, self.substeps, looped=large), parts
+        held, external = len(self.motion.held), len(self.motion.external)
+        if held:
+            points = inputs.reshape(-1, external) if external else inputs.reshape(1, 0)
+            control = jnp.broadcast_to(now[:held], (len(points), held))
+            inputs = jnp.concatenate([control, points], axis=1).ravel()
+        return advance(step, state, inputs, held + external, self.substeps, looped=large)
 
     def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with the exponentials of an exact integrator.
@@ -282,7 +339,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def _by_stages(self) -> bool:
-        few = self.substeps <= UNROLLED and not self._large
+        few = self.substeps <= UNROLLED and not self._large and not self.motion.held
         return self.motion.scheme.has_adjoint and few and self.differentiable
 
     def tangents(

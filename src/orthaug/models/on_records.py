@@ -15,6 +15,7 @@ from orthaug.data.record import Channel, Experiment, Preparation, Record, same_s
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory
+from orthaug.physics.innovations import InnovationsModel
 from orthaug.physics.noise import NoiseModel
 
 RUNAWAY = 1e6  # times the largest training output: a free run beyond this has diverged
@@ -39,7 +40,7 @@ class RecordModel(Generic[Form]):
     deviation: Vector
     weight: Matrix
     prepared: tuple[Preparation, ...]
-    noise: NoiseModel | None
+    noise: NoiseModel | InnovationsModel | None
 
     @property
     def coloured(self) -> bool:
@@ -122,7 +123,9 @@ class RecordModel(Generic[Form]):
                 outputs are missing samples and `gaps` are not allowed.
         """
         check_type(record, Record, "record", self._describe_wanted(need_outputs))
-        if not same_step(record.sampling_time, self.sampling_time):
+        if not self.form.steps_unevenly:
+            record.check_even("a model in lagged values")
+        if record.even and not same_step(record.sampling_time, self.sampling_time):
             raise InputError(
                 f"the record is sampled every {record.sampling_time:g} s, the model every "
                 f"{self.sampling_time:g} s; resample the record."
@@ -168,4 +171,5 @@ def trajectory(
         measured,
         first,
         experiment.start_time,
+        steps=experiment.steps,
     )

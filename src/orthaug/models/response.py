@@ -13,7 +13,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.data.record import Channel
+from orthaug.data.record import Channel, instants_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -101,6 +101,12 @@ class Trajectory:
     outside: Bool[np.ndarray, "N"] | None = None
     whole: Matrix | None = None
     std: Matrix | None = None
+    steps: Vector | None = None
+    """Seconds (N,) from each row to the next, where they are uneven."""
+
+    def time(self, sampling_time: float) -> Vector:
+        """Return the instants (N,) of the rows in s, the first of them 0."""
+        return instants_of(len(self.baseline), sampling_time, self.steps)
 
     def __repr__(self) -> str:
         samples, outputs = self.baseline.shape
@@ -215,7 +221,7 @@ class Response:
 
         trajectory = self.trajectories[experiment]
         columns: dict[str, Any] = {
-            "time": trajectory.start_time + np.arange(len(trajectory.model)) * self.sampling_time
+            "time": trajectory.start_time + trajectory.time(self.sampling_time)
         }
         for i, channel in enumerate(self.outputs):
             if trajectory.measured is not None:

@@ -151,6 +151,8 @@ def _gram(
     numbers = form.prepare(numbers)
     n0, m = states.shape
     directions = jnp.eye(n0)
+    first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))
+    sums = (first, jnp.zeros((n0, n0 + 1, m)), jnp.zeros(m))
 
     def step_and_output(state: Any, row: Any) -> Any:
         following, parts = form.step(numbers, state, row)
@@ -164,20 +166,31 @@ def _gram(
         )
         return along(directions)
 
-    def step(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        state, slopes, gram, square = carry
-        inputs, target, there = (part[i] for part in windows)
-        value, slope = jax.vmap(step_with_slopes, -1, -1)(state, inputs)
+    def add(i: Any, sums: tuple[Any, ...], value: Any, slope: Any) -> tuple[Any, ...]:
+        """Return slopes and sums after step i, from its values and slopes."""
+        slopes, gram, square = sums
+        _, target, there = (part[i] for part in windows)
         slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
         # Products of lanes are no matrix products
-        slope: Any = sum(slope[:, i, None] * slopes[None, i] for i in range(n0))
+        slope = sum(slope[:, i, None] * slopes[None, i] for i in range(n0))
         columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
         columns = jnp.where(there, columns, 0.0)
         columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
         gram = gram + sum(column[:n0, None] * column[None] for column in columns)
         square = square + sum(column[n0] ** 2 for column in columns)
-        return value[:n0], slope[:n0], gram, square
+        return slope[:n0], gram, square
 
-    first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))
-    start = (states, first, jnp.zeros((n0, n0 + 1, m)), jnp.zeros(m))
-    return jax.lax.fori_loop(0, steps, step, start)[2:]
+    if form.calls_host:  # the slopes of all steps at once, at the states of the run
+        step = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
+        _, run = jax.lax.scan(lambda x, row: (step(x, row), x), states, windows.inputs)
+        every = jax.vmap(jax.vmap(step_with_slopes, -1, -1))(run, windows.inputs)
+        return jax.lax.fori_loop(
+            0, steps, lambda i, sums: add(i, sums, *(part[i] for part in every)), sums
+        )[1:]
+
+    def advance(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        state, *sums = carry
+        value, slope = jax.vmap(step_with_slopes, -1, -1)(state, windows.inputs[i])
+        return value[:n0], *add(i, tuple(sums), value, slope)
+
+    return jax.lax.fori_loop(0, steps, advance, (states, *sums))[2:]

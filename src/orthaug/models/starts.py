@@ -23,8 +23,11 @@ from orthaug.models.kalman import Filter
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.on_records import RecordModel
+from orthaug.models.predictor import predictor_of
 from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
 from orthaug.models.stepping import Memory, checked_row, step_inputs, with_scheme
+from orthaug.physics.innovations import InnovationsModel
+from orthaug.physics.noise import NoiseModel
 
 FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
@@ -233,7 +236,7 @@ class PastOutputs:
         model: RecordModel[LaggedDynamics], experiment: Experiment, record: Record, horizon: int
     ) -> Float[np.ndarray, "m h ny"] | None:
         """Return the noise model's forecasts on the way to every row; None for white noise."""
-        if not model.coloured or model.noise is None:
+        if not model.coloured or not isinstance(model.noise, NoiseModel):
             return None
         measured = experiment.outputs[model.form.first_row :]
         x = model.form.regressors(experiment, record)
@@ -286,15 +289,7 @@ class EstimatedStates:
             return np.zeros(form.states)
         rows = rows[:size]
         inputs = form.inputs(experiment, record)[: len(rows)]
-        rows = rows[: len(inputs)]
-        windows = Windows(
-            _pad(inputs, size), _pad(rows, size), (np.arange(size) < len(rows))[:, None]
-        )
-        guess = form.start(rows, [0]).T
-        settled = settle(
-            form, model.numbers, guess, windows, model.weight, self.loose, _GUESS_ITERATIONS
-        )[0]
-        return settled[:, 0]
+        return self._settled(model, form, model.numbers, inputs, rows[: len(inputs)])
 
     def at(
         self,
@@ -319,6 +314,8 @@ class EstimatedStates:
         horizon: int,
     ) -> Predicted:
         model.check_rows(experiment, horizon)
+        if model.coloured:
+            return self._follow(model, experiment, record, horizon)
         # Short recordings have at least one prediction
         window = min(self.window, len(experiment) - horizon)
         form, numbers, steps = model.form, model.numbers, window + horizon
@@ -358,6 +355,54 @@ class EstimatedStates:
         nothing = np.zeros_like(outputs)
         return Predicted(window + horizon - 1, Parts(outputs, nothing, nothing), physics)
 
+    def _follow(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        horizon: int,
+    ) -> Predicted:
+        """Return predictions from the states of the one-step predictor, as `predict`."""
+        window = min(self.window, len(experiment) - horizon)
+        form = predictor_of(model.form)
+        assert isinstance(model.noise, InnovationsModel)
+        rows, numbers = form.inputs(experiment, record), model.numbers
+        numbers = numbers._replace(correction=model.noise.gain)
+        start = self._settled(model, form, numbers, rows, experiment.outputs[:window])
+        ends: list[tuple[Any, Numbers]] = [(form, numbers)]
+        if form.learns:
+            alone = numbers.physics_only._replace(correction=model.noise.gain)
+            ends.append((form.physics_only, alone))
+        outputs = []
+        for corrected, own in ends:
+            states = corrected.run(own, start, rows).states[window : len(rows) - horizon + 1]
+            plain, inputs = corrected.plain, corrected.plain.inputs(experiment, record)[window:]
+            windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)
+            outputs.append(_last_of(plain, own, states, windows))
+        nothing = np.zeros_like(outputs[0])
+        return Predicted(window + horizon - 1, Parts(outputs[0], nothing, nothing), outputs[-1])
+
+    def _settled(
+        self,
+        model: RecordModel[MotionDynamics],
+        form: MotionDynamics,
+        numbers: Numbers,
+        inputs: Matrix,
+        outputs: Matrix,
+    ) -> Vector:
+        """Return the state at the first row by which a run follows the first outputs best."""
+        size = max(FIRST_ROWS, self.window)
+        windows = Windows(
+            _pad(inputs[: len(outputs)], size),
+            _pad(outputs, size),
+            (np.arange(size) < len(outputs))[:, None],
+        )
+        guess = form.start(outputs, [0]).T
+        settled = settle(
+            form, numbers, guess, windows, model.weight, self.loose, _GUESS_ITERATIONS
+        )[0]
+        return settled[:, 0]
+
     def _begin(
         self,
         model: RecordModel[MotionDynamics],
@@ -382,17 +427,30 @@ class EstimatedStates:
     def points(self, model: RecordModel[MotionDynamics], record: Record) -> Matrix:
         """Return the finite states and inputs (N, nx + nu) of the free run."""
         record = model.fitting(record, need_outputs=False)
-        runs = [
-            model.form.run(
-                model.numbers,
-                self.first(model, experiment, record, "measured"),
-                model.form.inputs(experiment, record),
+        form, pieces = model.form, []
+        for experiment in record.experiments:
+            rows = form.inputs(experiment, record)
+            start = self.first(model, experiment, record, "measured")
+            states = form.run(model.numbers, start, rows).states
+            pieces.append(
+                np.concatenate([states, form.at_samples(model.numbers, states, rows)], axis=1)
             )
-            for experiment in record.experiments
-        ]
-        inputs = np.concatenate([e.inputs for e in record.experiments])
-        points = np.concatenate([np.concatenate([run.states for run in runs]), inputs], axis=1)
+        points = np.concatenate(pieces)
         return points[np.isfinite(points).all(axis=1)]
+
+
+def _last_of(
+    form: MotionDynamics, numbers: Numbers, states: Matrix, windows: Float[np.ndarray, "m nu T"]
+) -> Matrix:
+    """Return the outputs (m, ny) at the ends of runs from states (m, nx) along windows."""
+
+    def ahead(states: Matrix, windows: np.ndarray) -> Parts:
+        inputs, steps = np.moveaxis(windows, (0, 2), (2, 0)), windows.shape[2]
+        found = last_outputs(form, numbers, states.T, inputs, steps)
+        return Parts(*(np.asarray(part).T for part in found))
+
+    largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
+    return in_batches(ahead, (states, windows), largest).total
 
 
 def _pad(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:

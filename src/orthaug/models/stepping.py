@@ -109,13 +109,14 @@ def step_inputs(form: MotionDynamics) -> tuple[str, ...]:
         InputError: a hold that needs the whole record.
     """
     motion = form.motion
-    if motion.hold == "spline" and motion.inputs:
+    if motion.hold == "spline" and motion.external:
         raise InputError(
             "a step cannot interpolate by a spline over the whole record; fit the motion with "
             "hold = 'zero-order' or 'first-order' to step or export it."
         )
-    after = tuple(f"{name}[k+1]" for name in motion.inputs) if motion.hold == "first-order" else ()
-    return (*motion.inputs, *after)
+    names = motion.external
+    after = tuple(f"{name}[k+1]" for name in names) if motion.hold == "first-order" else ()
+    return (*names, *after)
 
 
 def with_scheme(form: MotionDynamics, numbers: Numbers) -> Numbers:

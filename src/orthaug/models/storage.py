@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import check_type, is_number
-from orthaug._base.errors import InputError, show
+from orthaug._base.errors import InputError, MissingFileError, show
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
 from orthaug._base.registry import freeze
@@ -32,7 +32,12 @@ from orthaug.models.moving import MotionDynamics
 from orthaug.models.packed_files import pack, read_packed, write_packed
 from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
+from orthaug.physics import source_kinds
 from orthaug.physics.baseline import Baseline, Parameter, Term
+from orthaug.physics.closed_loop import close_loop, controller_of
+from orthaug.physics.consent import CONSENTS
+from orthaug.physics.controller import Controller
+from orthaug.physics.innovations import InnovationsModel
 from orthaug.physics.motion import Motion, Output, State
 from orthaug.physics.noise import NoiseModel
 from orthaug.physics.parameters import PhysicalParameter
@@ -79,8 +84,9 @@ def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
 
 
 def write(model: Model, folder: Path) -> None:
-    """Write the two files into an existing folder."""
+    """Write the two files into an existing folder, with the file that its physics come from."""
     write_packed(_pack(model), folder / _DECLARATION, folder / _ARRAYS)
+    source_kinds.write_kept(getattr(getattr(model.form, "motion", None), "source", None), folder)
 
 
 def digest(model: Model) -> str:
@@ -94,7 +100,11 @@ def _pack(model: Model) -> tuple[dict[str, Any], bytes]:
 
 
 def load(
-    folder: str | Path, *, baseline: Baseline | Motion | None = None, learner: Learner | None = None
+    folder: str | Path,
+    *,
+    baseline: Baseline | Motion | None = None,
+    learner: Learner | None = None,
+    run_fmu: bool = False,
 ) -> Model:
     """Read a model that `save` or `orthaug fit` wrote.
 
@@ -102,9 +112,12 @@ def load(
         folder: the model's folder, or the result folder that holds it as `model/`.
         baseline, learner: the Python callables again, where the saved model had such; a motion
             counts as a baseline.
+        run_fmu: whether the native code of an FMU in the model may run. One that this program, or
+            a spec that was fitted on this account, names itself runs without.
 
     Raises:
-        InputError: no model there; a file that is cut, altered, or from a newer version.
+        InputError: no model there; a file that is cut, altered, or from a newer version; an FMU
+            without consent.
     """
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
@@ -117,13 +130,16 @@ def load(
     except ValueError:  # a NUL byte in the name
         there = False
     if not there:
-        raise InputError(f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}.")
+        raise MissingFileError(
+            f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}."
+        )
     declared, arrays = read_packed(
         folder / _DECLARATION, folder / _ARRAYS, FORMAT, "model", "fit again, or copy it again"
     )
     path = folder / _DECLARATION
     try:
-        model = _rebuild(declared, arrays, baseline, learner, path)
+        with CONSENTS.given_to_all(run_fmu):
+            model = _rebuild(declared, arrays, baseline, learner, path)
         check_loaded(model, path)
         return model
     except InputError:
@@ -251,7 +267,7 @@ def _declare_lagged(
         },
     }
     arrays = {"shared": model.shared}
-    if model.noise is not None:
+    if isinstance(model.noise, NoiseModel):
         declared["noise"] = [list(orders) for orders in model.noise.orders]
         arrays |= {"noise.values": model.noise.values, "noise.covariance": model.noise.covariance}
     return declared, {}, arrays
@@ -299,18 +315,17 @@ def _lagged_fields(
 def _declare_motion(
     model: Model[MotionDynamics],
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    form, motion, trained = model.form, model.form.motion, model.trained
-    parameters = []
-    for parameter in motion.parameters:
-        entry = asdict(parameter)
-        parameters.append(entry | {k: None for k, limit in _LIMITS.items() if entry[k] == limit})
+    form, trained = model.form, model.trained
+    loop, motion = form.motion, form.motion.plant
+    source = {} if motion.source is None else {"source": source_kinds.declare(motion.source)}
     of_form = {
         "motion": {
             "kind": "equations" if motion.functions is None else "callable",
+            **source,
             "states": [asdict(state) for state in motion.states],
             "outputs": [asdict(output) for output in motion.outputs],
             "inputs": list(motion.inputs),
-            "parameters": parameters,
+            "parameters": _declare_parameters(motion.parameters),
             "constants": dict(motion.constants),
             "define": {name: expression.text for name, expression in motion.definitions},
             "integrator": motion.integrator,
@@ -319,6 +334,10 @@ def _declare_motion(
         },
         "features": [entry.text for entry in form.features],
     }
+    controller = controller_of(loop)
+    if controller is not None:
+        own = {"parameters": _declare_parameters(controller.parameters), "inputs": loop.external}
+        of_form["controller"] = asdict(controller) | own
     of_training: dict[str, Any] = {
         "substeps": form.substeps,
         "window": model.window,
@@ -326,18 +345,47 @@ def _declare_motion(
     }
     assert isinstance(model.starts, EstimatedStates)
     arrays = {"loose": model.starts.loose, "seen": model.seen}
+    if isinstance(model.noise, InnovationsModel):
+        of_form["noise"] = "innovations"
+        arrays |= {"noise.gain": model.noise.gain, "noise.covariance": model.noise.covariance}
     if trained is not None:
         of_training["trained"] = {key: getattr(trained, key) for key in _SEGMENTATION}
         arrays |= {f"trained.{key}": getattr(trained, key) for key in _ON_SEGMENTS}
     return of_form, of_training, arrays
 
 
-def _rebuild_motion(declared: dict[str, Any], given: Any, path: Path) -> Motion:
-    kept = declared["motion"]
-    parameters = [
+def _declare_parameters(parameters: Sequence[PhysicalParameter]) -> list[dict[str, Any]]:
+    """Return the fields of parameters, None for a limit that is infinite."""
+    entries = [asdict(parameter) for parameter in parameters]
+    return [e | {k: None for k, limit in _LIMITS.items() if e[k] == limit} for e in entries]
+
+
+def _rebuild_parameters(kept: Any) -> list[PhysicalParameter]:
+    return [
         PhysicalParameter(**(p | {k: limit for k, limit in _LIMITS.items() if p[k] is None}))
-        for p in kept["parameters"]
+        for p in kept
     ]
+
+
+def _rebuild_motion(declared: dict[str, Any], given: Any, path: Path) -> Motion:
+    motion = _rebuild_plant(declared, given, path)
+    kept = declared.get("controller")
+    if kept is None:
+        return motion
+    controller = Controller(
+        outputs=tuple(map(tuple, kept["outputs"])),
+        states=tuple(State(**state) for state in kept["states"]),
+        parameters=tuple(_rebuild_parameters(kept["parameters"])),
+        constants=tuple(map(tuple, kept["constants"])),
+        definitions=tuple(map(tuple, kept["definitions"])),
+    )
+    outputs = [channel["name"] for channel in declared["outputs"]]
+    return close_loop(motion, controller, kept["inputs"], outputs)
+
+
+def _rebuild_plant(declared: dict[str, Any], given: Any, path: Path) -> Motion:
+    kept = declared["motion"]
+    parameters = _rebuild_parameters(kept["parameters"])
     states, outputs = [State(**s) for s in kept["states"]], [Output(**o) for o in kept["outputs"]]
     options = {name: kept[name] for name in ("integrator", "substeps", "hold")}
     if kept["kind"] == "equations":
@@ -345,6 +393,9 @@ def _rebuild_motion(declared: dict[str, Any], given: Any, path: Path) -> Motion:
         return Motion.from_equations(
             states, outputs, parameters, kept["inputs"], **named, **options
         )
+    if given is None and "source" in kept:
+        names = [o.name for o in outputs]
+        given = source_kinds.rebuild(kept["source"], path.parent).build(kept["inputs"], names)
     if not isinstance(given, Motion) or given.functions is None:
         raise InputError(
             f"{path}: the motion was two Python functions; give them again, load(…, "
@@ -385,11 +436,15 @@ def _motion_fields(
         own: dict[str, Any] = {key: int(kept[key]) for key in _SEGMENTATION}
         own |= {key: arrays.get(f"trained.{key}") for key in _ON_SEGMENTS}
         trained = TrainedSegments(**own)
+    noise = None
+    if declared.get("noise") == "innovations":
+        noise = InnovationsModel(arrays["noise.gain"], arrays.get("noise.covariance"))
     return {
         "form": form,
         "starts": EstimatedStates(int(declared["window"]), arrays["loose"]),
         "trained": trained,
         "seen": arrays.get("seen"),
+        "noise": noise,
     }
 
 
@@ -553,8 +608,10 @@ def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | N
         if getattr(numbers, name) is not None:
             yield name, getattr(numbers, name), None
     noise = getattr(model, "noise", None)
-    if noise is not None:
+    if isinstance(noise, NoiseModel):
         yield "noise model", noise.values, (sum(map(sum, noise.orders)),)
+    if isinstance(noise, InnovationsModel):
+        yield "gain of the predictor", noise.gain, (form.states, outputs)
     square = (outputs, outputs)
     for name, value, shape in (
         ("noise", kept.noise, square),

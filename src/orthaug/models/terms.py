@@ -18,9 +18,8 @@ from orthaug.data.regressors import Lags
 from orthaug.data.terms import TermLibrary
 from orthaug.models.beyond import BEYOND
 from orthaug.models.learners import Scaling, Tree
-from orthaug.physics.baseline import Baseline
+from orthaug.physics.baseline import Baseline, regressor_of
 from orthaug.physics.motion import Motion
-from orthaug.physics.problem import regressor_of
 
 _NAMED = 8  # terms
 Names = tuple[str, ...]
@@ -163,11 +162,7 @@ def over_lags(
 
 def over_states(learner: Any, motion: Motion) -> Any:
     """Return a learner whose library is written out over a motion's states and inputs."""
-    return (
-        learner.over([*motion.names_of_states, *motion.inputs])
-        if hasattr(learner, "over")
-        else learner
-    )
+    return learner.over([*motion.visible]) if hasattr(learner, "over") else learner
 
 
 def scaling_of(learner: Any, features: Matrix) -> Scaling:

@@ -1,6 +1,7 @@
 from .baseline import Baseline as Baseline
 from .baseline import Parameter as Parameter
 from .baseline import Term as Term
+from .controller import Controller as Controller
 from .excitation import identifiability as identifiability
 from .motion import Motion as Motion
 from .motion import Output as Output

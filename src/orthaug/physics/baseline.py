@@ -24,8 +24,10 @@ from orthaug.data.expressions import (
     parse,
 )
 from orthaug.data.record import Channel, same_step
-from orthaug.data.regressors import Layout, in_order
+from orthaug.data.regressors import Features, Lags, Layout, in_order
 from orthaug.data.writing import coefficient_unit
+
+_PARAMETERS = "a tuple of Parameters; `Baseline.from_terms` makes them from terms"
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,11 @@ class Baseline(NotebookView):
     constants: tuple[tuple[str, float], ...] = ()
     function: Callable[[Any], Any] | None = field(default=None, repr=False)
 
+    def __post_init__(self) -> None:
+        check_type(self.parameters, tuple, "parameters", _PARAMETERS)
+        for one in self.parameters:
+            check_type(one, Parameter, "parameters", _PARAMETERS)
+
     def __repr__(self) -> str:
         if self.function is not None:
             return f"Baseline(a function of the regressor, θ: {', '.join(self.names)})"
@@ -212,6 +219,11 @@ class Baseline(NotebookView):
     def names(self) -> tuple[str, ...]:
         """Parameter names in order of first appearance."""
         return tuple(p.name for p in self.parameters)
+
+    @property
+    def names_taken(self) -> list[str]:
+        """Names that a further parameter cannot have."""
+        return [*dict(self.constants), *(term.parameter for term in self.terms)]
 
     @property
     def initial(self) -> np.ndarray:
@@ -420,3 +432,44 @@ def derived_units(
         found.setdefault(term.parameter, set()).add("1" if unit == "" else unit)
     agreed = {name: next(iter(given)) for name, given in found.items() if len(given) == 1}
     return {name: unit for name, unit in agreed.items() if unit is not None}
+
+
+def regressor_of(
+    baseline: Baseline,
+    lags: Lags | None,
+    learner_inputs: tuple[str, ...] | None,
+    outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
+) -> tuple[Layout, Features]:
+    """Return the regressor of the whole model, and the learner's features of it.
+
+    Raises:
+        InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
+    """
+    chosen = (
+        in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    )
+    features = Features.of(chosen)
+    if learner_inputs is not None:
+        constants = dict(baseline.constants)
+        try:
+            expressions = [parse(text, constants) for text in learner_inputs]
+            for expression in expressions:
+                in_order(expression.lags, outputs, inputs)
+        except InputError as error:
+            raise InputError(f"learner input: {error}") from None
+        features = Features(tuple(expressions))
+    if baseline.function is not None:  # it takes the regressor exactly as `lags` orders it
+        if lags is None:
+            raise InputError(
+                "a baseline function needs `lags`: they define the regressor x that it is "
+                "called with."
+            )
+        missing = set(features.lags) - set(chosen)
+        if missing:
+            raise InputError(
+                f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not "
+                "contain."
+            )
+        return chosen, features
+    return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features

@@ -17,8 +17,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug.physics.excitation import GRAM_TOLERANCE, RANK_TOLERANCE, tied_columns
-from orthaug.physics.motion_problem import MotionProblem
-from orthaug.physics.problem import Problem
+from orthaug.physics.problem import MotionProblem, Problem
 
 _HALF_OF_THE_DIGITS = 1e-8  # σ/σmax of the unit-norm columns
 _NEARLY = 1e-4  # σ/σmax from which on dependence alone may be what hides a parameter

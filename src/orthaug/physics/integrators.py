@@ -14,7 +14,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug._base.registry import Registry
 
@@ -27,12 +28,21 @@ Step = Callable[[Any, Any, Any, Any], Any]
 """x one substep later, of x and the inputs at its begin, middle and end."""
 
 
-def inputs_at_points(inputs: Matrix, hold: str, substeps: int) -> Matrix:
+def inputs_at_points(
+    inputs: Matrix, hold: str, substeps: int, pace: Vector | None = None
+) -> Matrix:
     """Return the inputs (N, nu) at the points of each sample that a step reads, (N, points nu).
 
     One point under a zero-order hold, both ends under a first-order hold, and under a spline hold
     the ends and middles of all substeps, on a cubic spline through the record.
+
+    Args:
+        pace: length (N,) of each step over that of the others, where they differ. A last column
+            then has what it is longer by, `pace − 1`, which `split_pace` takes off again.
     """
+    if pace is not None:
+        points = _uneven_points(inputs, hold, substeps, pace)
+        return np.concatenate([points, pace[:, None] - 1], axis=1)
     rows, nu = inputs.shape
     if hold == "zero-order" or not nu:
         return inputs
@@ -44,6 +54,32 @@ def inputs_at_points(inputs: Matrix, hold: str, substeps: int) -> Matrix:
     return _interleave(
         *(spline(np.minimum(k + i / (2 * substeps), rows - 1)) for i in range(2 * substeps + 1))
     )
+
+
+def _uneven_points(inputs: Matrix, hold: str, substeps: int, pace: Vector) -> Matrix:
+    rows, nu = inputs.shape
+    if hold != "spline" or not nu:
+        return inputs_at_points(inputs, hold, substeps)
+    if rows < 4:
+        raise InputError(
+            f"a spline through uneven instants needs 4 rows; an experiment has {rows}. Give "
+            '`hold = "first-order"`.'
+        )
+    from scipy.interpolate import CubicSpline  # slow to import, and few runs need it
+
+    instants = np.concatenate([[0.0], np.cumsum(pace[:-1])])
+    spline = CubicSpline(instants, inputs)
+    ahead = [instants + i / (2 * substeps) * pace for i in range(2 * substeps + 1)]
+    return _interleave(*(spline(np.minimum(t, instants[-1])) for t in ahead))
+
+
+def split_pace(row: Any, hold: str, substeps: int, nu: int) -> tuple[Any, Any]:
+    """Return the inputs (points nu,) that a step reads, and its length over that of an even one.
+
+    A row of even samples has no pace; the length is then 1.
+    """
+    points = {"zero-order": 1, "first-order": 2}.get(hold, 2 * substeps + 1)
+    return (row[:-1], 1.0 + row[-1]) if row.shape[0] == points * nu + 1 else (row, 1.0)
 
 
 def _interleave(*points: Matrix) -> Matrix:

@@ -96,7 +96,7 @@ def add_memory(
         )
     names = names_of_memory(motion, memory.states)
     learned = [motion.names_of_states[i] for i in motion.learned[0]]
-    sources = tuple(inputs or ()) or (*learned, *motion.names_of_states)
+    sources = tuple(inputs or ()) or (*learned, *motion.visible_states)
     constants = memory.time_constants or tuple(_spread(record, memory.states))
     added = [
         State(

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from orthaug._base.checks import Vector, check_choice, check_label, check_unique
 from orthaug._base.errors import InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
+from orthaug.data.record import Record
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.integrators import INTEGRATORS, Integrator
 from orthaug.physics.parameters import (
@@ -31,6 +33,30 @@ from orthaug.physics.parameters import (
 HOLDS = ("zero-order", "first-order", "spline")
 MOST_SUBSTEPS = 256
 _DERIVATIVE = "derivative of "
+
+
+@runtime_checkable
+class Origin(Protocol):
+    """What the functions of a motion come from; `physics.sources` has them."""
+
+    @property
+    def operations(self) -> int:
+        """How many operations the functions have, roughly, where they are JAX's; 0 for few."""
+        ...
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the functions are JAX's; others are calls of the host at every point."""
+        ...
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Every file that it reads."""
+        ...
+
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of its declaration, as a saved model has them."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -112,6 +138,8 @@ class Motion(NotebookView):
     hold: str = "zero-order"
     functions: tuple[Callable[..., Any], Callable[..., Any]] | None = None
     """f(x, u, p) and h(x, u, p) on JAX arrays, instead of expressions."""
+    source: Origin | None = field(default=None, compare=False, repr=False)
+    """Where the functions come from, so that a saved model finds them again."""
 
     @property
     def scheme(self) -> Integrator:
@@ -370,6 +398,72 @@ class Motion(NotebookView):
         return replace(self, states=tuple(s for s in self.states if not s.memory))
 
     @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the inputs that a controller sets: the first ones, held over a sample."""
+        return ()
+
+    @property
+    def external(self) -> tuple[str, ...]:
+        """Names of the inputs that a record gives."""
+        return self.inputs[len(self.held) :]
+
+    @property
+    def discrete_states(self) -> tuple[str, ...]:
+        """Names of states that change at samples only: those of a controller."""
+        return ()
+
+    @property
+    def visible(self) -> tuple[str, ...]:
+        """Names of states and inputs that a learner may see."""
+        return (*self.visible_states, *self.inputs)
+
+    @property
+    def visible_states(self) -> tuple[str, ...]:
+        """Names of states that a learner may see: all but a controller's."""
+        return tuple(name for name in self.names_of_states if name not in self.discrete_states)
+
+    def around(self, plant: Motion) -> Motion:
+        """Return another plant with the same controller around it, if there is one."""
+        return plant
+
+    @property
+    def driving(self) -> tuple[str, ...]:
+        """Names of the record's inputs that drive the equations between samples."""
+        return tuple(name for name in self.external if name in self.visible)
+
+    @property
+    def plant(self) -> Motion:
+        """The motion without a controller around it."""
+        return self
+
+    def control(self, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        """Return the inputs (held, …) that a controller sets at a sample.
+
+        From outputs y (ny, …), states x (nx, …), and inputs u (external, …) of the record.
+        """
+        return u[:0]
+
+    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        """Return the next states (nx, …), with those that change at samples.
+
+        `following` are the integrated ones, `u` (nu, …) all inputs at the sample before.
+        """
+        return following
+
+    def inputs_at(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        """Return all inputs (nu, …) at samples with states x (nx, …), from the record's."""
+        if not self.held:
+            return u
+        nothing = xp.zeros((len(self.held), *u.shape[1:]))
+        y = self.observed(x, xp.concatenate([nothing, u]), p, xp)
+        return xp.concatenate([self.control(y, x, u, p, xp), u])
+
+    @property
+    def names_taken(self) -> list[str]:
+        """Names that a further parameter cannot have."""
+        return list(self.known)
+
+    @property
     def known(self) -> dict[str, float]:
         """Every name that expressions may use."""
         named = dict.fromkeys((*self.names_of_states, *self.inputs, *self.names), 1.0) | dict(
@@ -394,6 +488,16 @@ class Motion(NotebookView):
             self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
         )
 
+    def check_paced(self, record: Record) -> None:
+        """Raise InputError unless the motion can step between uneven instants."""
+        if self.scheme.splits_linear_part or self.scheme.discrete:
+            record.check_even(f'`integrator = "{self.integrator}"`')
+        if self.held:
+            record.check_even("a controller, which acts at every sample,")
+        texts = (*self.equations.values(), *(given for _, given in self.definitions))
+        if any(SAMPLING_TIME in expression.names for expression in texts):
+            record.check_even(f"an equation with the sampling time {SAMPLING_TIME}")
+
     @cached_property
     def equations(self) -> dict[str, Expression]:
         """The parsed equation of each state."""
@@ -411,9 +515,9 @@ class Motion(NotebookView):
 
     @cached_property
     def size(self) -> int:
-        """Return how many operations its expressions have; 0 of a motion of functions."""
+        """Return how many operations its expressions have; of functions what the source says."""
         if self.functions is not None:
-            return 0
+            return 0 if self.source is None else self.source.operations
         every = (
             *self.equations.values(),
             *self.observations,
@@ -510,9 +614,9 @@ class Motion(NotebookView):
                 raise InputError(
                     f"the motion gives the output '{name}', which the data do not have{hint}."
                 )
-        if tuple(inputs) != self.inputs or [*outputs] != given:
+        if tuple(inputs) != self.external or [*outputs] != given:
             raise InputError(
-                f"the motion has the inputs {', '.join(self.inputs) or 'none'} and the outputs "
+                f"the motion has the inputs {', '.join(self.external) or 'none'} and the outputs "
                 f"{', '.join(given)}; the record has {', '.join(inputs) or 'none'} and "
                 f"{', '.join(outputs)}. Give them in one order."
             )

@@ -1,14 +1,15 @@
-"""The estimation problem: rows, physics matrix and projection of a record, checked.
+"""The estimation problem: a record with its physics, checked against each other.
 
-Everything that can be wrong with data and physics together is found here, without JAX.
+Everything that can be wrong with data and physics together is found here, without JAX. Lagged
+physics has rows, a physics matrix and its projection; a motion has its equations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.parallel import one_blas_thread
-from orthaug.data.expressions import Lag, parse
+from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import (
     Features,
@@ -27,70 +28,123 @@ from orthaug.data.regressors import (
     lag_matrix,
     stack_rows,
 )
-from orthaug.physics.baseline import Baseline, Parameter, derived_units
+from orthaug.physics.baseline import Baseline, Parameter, derived_units, regressor_of
 from orthaug.physics.excitation import Excitation, excitation, require_rank
+from orthaug.physics.guessed_motion import GuessedMotion, SignalName, check_start, layout_of
+from orthaug.physics.learner_states import LearnerStates, add_memory
+from orthaug.physics.moments import Extent, Moments
+from orthaug.physics.motion import Motion
 from orthaug.physics.noise import RowFilter
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
+from orthaug.physics.parameters import PhysicalParameter
 from orthaug.physics.projection import Projection
+from orthaug.physics.row_checks import check_moving, check_physics, check_sizes, feature_rows
 from orthaug.physics.shared import SharedDirections, shared_directions
-
-# Size of outputs and regressors whose squares still add up; 1 / _LARGEST is the smallest
-_LARGEST = 1e120
 
 _SMALLEST_RESIDUAL = 1e-10  # of an output's deviation: the physics leaves at least rounding
 
 
-class Extent(NamedTuple):
-    """Smallest and largest value of some columns, (n,) each; `|` joins those of two parts."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedProblem:
+    """A record posed with physics of any kind: what training, splits and findings ask of both.
 
-    low: Vector
-    high: Vector
+    `deviation` (ny,) is the standard deviation of the outputs. `weight` weighs them against each
+    other, for criterion and measure alike.
+    """
 
-    @classmethod
-    def of(cls, values: Matrix) -> Extent:
-        return cls(values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf))
+    record: Record
+    deviation: Vector
+    weight: OutputWeights
 
-    def __or__(self, other: Extent) -> Extent:
-        return Extent(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
-
-
-class Moments(NamedTuple):
-    """Count, mean and scatter `Σ (v − v̄)(v − v̄)ᵀ` of columns; `|` joins those of two parts."""
-
-    count: int
-    mean: Vector
-    scatter: Matrix
-
-    @classmethod
-    def of(cls, values: Matrix) -> Moments:
-        mean = values.mean(axis=0) if len(values) else np.zeros(values.shape[1])
-        return cls(len(values), mean, (values - mean).T @ (values - mean))
-
-    def __or__(self, other: Moments) -> Moments:
-        """Return the moments of both together (Chan, Golub and LeVeque 1983)."""
-        count = self.count + other.count
-        if not count:
-            return self
-        apart = other.mean - self.mean
-        scatter = (
-            self.scatter
-            + other.scatter
-            + np.outer(apart, apart) * (self.count * other.count / count)
-        )
-        return Moments(count, self.mean + apart * (other.count / count), scatter)
+    new_state: ClassVar[str]
+    """Remedy for a state that the physics lacks, in words."""
+    streamed: ClassVar[bool] = False
+    """True where the rows stay in a source, and `rows` are a subsample of them."""
 
     @property
-    def covariance(self) -> Matrix:
-        return self.scatter / max(self.count, 1)
+    def physics(self) -> Baseline | Motion:
+        """The physics that the record is fitted with."""
+        raise NotImplementedError
 
     @property
-    def square(self) -> float:
-        """Sum of all squares."""
-        return float(np.trace(self.scatter) + self.count * self.mean @ self.mean)
+    def physics_in_words(self) -> str:
+        """The physics in a few words."""
+        return repr(self.physics)
+
+    @property
+    def parameters(self) -> tuple[Parameter | PhysicalParameter, ...]:
+        """The parameters of the physics, as declared."""
+        return self.physics.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.physics.names
+
+    @property
+    def linear(self) -> bool:
+        """True if the physics is linear in its parameters."""
+        return False
+
+    @property
+    def derived_units(self) -> dict[str, str]:
+        """Units of parameters that follow from those of the channels."""
+        return {}
+
+    def values_at(self, theta: Vector) -> Vector:
+        """Return the values of the parameters at θ̂, or at their coordinates."""
+        return theta
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(channel.name for channel in self.record.outputs)
+
+    @property
+    def feature_count(self) -> int:
+        """Number of inputs of a learner."""
+        raise NotImplementedError
+
+    @property
+    def learner_outputs(self) -> int:
+        """Number of outputs of a learner."""
+        return len(self.outputs)
+
+    @property
+    def first_row(self) -> int:
+        """The first row of an experiment that the physics is evaluated at."""
+        return 0
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.record)
+
+    @property
+    def rows_in_memory(self) -> int:
+        """Number of rows that are in memory."""
+        return self.count
+
+    @property
+    def largest_output(self) -> Vector:
+        """The largest size of each output (ny,)."""
+        return np.max([np.abs(e.outputs).max(axis=0) for e in self.record.experiments], axis=0)
+
+    def physics_alone(self) -> PosedProblem:
+        """Return the problem without a learner."""
+        raise NotImplementedError
+
+    def on(self, record: Record) -> PosedProblem:
+        """Return the problem with the same physics and features on another record."""
+        raise NotImplementedError
+
+    @property
+    def poser(self) -> Callable[[Record], PosedProblem]:
+        """Function that poses the problem on another record; it can be sent to a process."""
+        raise NotImplementedError
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem(PosedProblem):
     """Usable rows of a record, and all quantities that do not depend on the learner's weights.
 
     `weight` weighs the outputs, for criterion and measure alike: so F1 holds for several outputs
@@ -98,18 +152,20 @@ class Problem:
     `deviation` (ny,) the standard deviation of the outputs themselves.
     """
 
-    record: Record
     baseline: Baseline
     features: Features
     layout: Layout
     rows: UsableRows
     target: Float[np.ndarray, "N ny"]
-    deviation: Vector
-    weight: OutputWeights
     projection: Projection
     excitation: Excitation
-    noise: RowFilter | None = field(default=None, kw_only=True)
+    noise: RowFilter | None = None
     """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY."""
+
+    new_state: ClassVar[str] = (
+        "add lags of outputs and inputs to the physics, or write the system as a motion with that "
+        "state"
+    )
 
     def __repr__(self) -> str:
         lags = ", ".join(str(lag) for lag in self.layout)
@@ -119,32 +175,9 @@ class Problem:
         )
 
     @property
-    def new_state(self) -> str:
-        """Remedy for a state that the physics lacks, in words."""
-        return (
-            "add lags of outputs and inputs to the physics, or write the system as a motion with "
-            "that state"
-        )
-
-    @property
     def physics(self) -> Baseline:
         """The physics that the record is fitted with."""
         return self.baseline
-
-    @property
-    def physics_in_words(self) -> str:
-        """The physics in a few words."""
-        return repr(self.baseline)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters of the physics, as declared."""
-        return self.baseline.parameters
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.baseline.names
 
     @property
     def linear(self) -> bool:
@@ -155,10 +188,6 @@ class Problem:
     def derived_units(self) -> dict[str, str]:
         """Units of parameters that follow from those of the channels."""
         return derived_units(self.baseline, self.record.outputs, self.record.inputs)
-
-    def values_at(self, theta: Vector) -> Vector:
-        """Return the values of the parameters at θ, which they are."""
-        return theta
 
     @property
     def rows_in_memory(self) -> int:
@@ -171,18 +200,9 @@ class Problem:
         return len(self.features.entries)
 
     @property
-    def learner_outputs(self) -> int:
-        """Number of outputs of a learner."""
-        return len(self.outputs)
-
-    @property
     def lengths(self) -> tuple[int, ...]:
         """Rows of each experiment."""
         return tuple(len(part) - self.rows.start for part in self.record.experiments)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        return tuple(channel.name for channel in self.record.outputs)
 
     @property
     def first_row(self) -> int:
@@ -264,11 +284,6 @@ class Problem:
     def target_covariance(self) -> Matrix:
         return Moments.of(self.target).covariance
 
-    @property
-    def largest_output(self) -> Vector:
-        """The largest size of each output (ny,)."""
-        return np.max([np.abs(e.outputs).max(axis=0) for e in self.record.experiments], axis=0)
-
     @cached_property
     def shared(self) -> SharedDirections:
         """The directions of θ that a learner on these features could imitate."""
@@ -308,10 +323,12 @@ class Problem:
 
     def on(self, record: Record) -> Problem:
         """Return the problem with the same physics and features on another record."""
-        posed = _pose(record, self.baseline, self.layout, self.features, self.weight.choice)
-        if self.noise is None:
-            return posed
-        return posed.filtered(replace(self.noise, lengths=posed.lengths))
+        return self.poser(record)
+
+    @property
+    def poser(self) -> Callable[[Record], Problem]:
+        """Function that poses the problem on another record, without these rows: it can be sent."""
+        return _Poser(self.baseline, self.layout, self.features, self.weight.choice, self.noise)
 
     def weigh(self, weight: OutputWeights) -> Problem:
         """Return the problem with other output weights."""
@@ -334,6 +351,23 @@ class Problem:
         """Least and largest value of each of the learner's features over the rows."""
         z = self.feature_rows()
         return np.stack([z.min(axis=0), z.max(axis=0)])
+
+
+@dataclass(frozen=True)
+class _Poser:
+    """What a problem is posed by, without its rows."""
+
+    baseline: Baseline
+    layout: Layout
+    features: Features
+    output_weights: str | Sequence[float]
+    noise: RowFilter | None
+
+    def __call__(self, record: Record) -> Problem:
+        posed = _pose(record, self.baseline, self.layout, self.features, self.output_weights)
+        if self.noise is None:
+            return posed
+        return posed.filtered(replace(self.noise, lengths=posed.lengths))
 
 
 @one_blas_thread()
@@ -365,6 +399,7 @@ def pose(
     record.check_measured()
     check_output_weights(output_weights, len(outputs))
     baseline.check_initial()
+    record.check_even("physics in lagged values")
     baseline = baseline.sampled(record.sampling_time)
     baseline.check_channels(outputs, inputs)
     layout, features = regressor_of(baseline, lags, learner_inputs, outputs, inputs)
@@ -401,7 +436,16 @@ def _pose(
     if require_full_rank:
         require_rank(excited, rows.y.size)
     return Problem(
-        record, baseline, features, layout, rows, target, deviation, weight, projection, excited
+        record=record,
+        baseline=baseline,
+        features=features,
+        layout=layout,
+        rows=rows,
+        target=target,
+        deviation=deviation,
+        weight=weight,
+        projection=projection,
+        excitation=excited,
     )
 
 
@@ -418,111 +462,138 @@ def check_defined(problem: Problem, record: Record) -> None:
         feature_rows(problem.features, rows, layout, alone)
 
 
-def feature_rows(features: Features, rows: UsableRows, layout: Layout, record: Record) -> Matrix:
-    """Return the learner's features (N, nz) of some rows; InputError where one is not finite."""
-    with np.errstate(all="ignore"):
-        z = np.asarray(features.evaluate(rows.x, layout, np))
-    for j, entry in enumerate(features.entries):
-        _check_finite(z[:, j], f"the learner input {entry}", rows, record)
-    return z
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MotionProblem(GuessedMotion, PosedProblem):
+    """A record with its motion; `features` are what a learner sees."""
+
+    features: tuple[Expression, ...]
+
+    new_state: ClassVar[str] = "write the state out as a state of the motion with its own equation"
+
+    def __repr__(self) -> str:
+        motion = self.motion
+        return (
+            f"MotionProblem({len(self.record)} rows of {', '.join(self.outputs)}, states "
+            f"{motion.names_of_states})"
+        )
+
+    @property
+    def physics(self) -> Motion:
+        return self.motion
+
+    @property
+    def physics_in_words(self) -> str:
+        return f"motion of {', '.join(self.motion.names_of_states)}"
+
+    def values_at(self, theta: Vector) -> Vector:
+        return self.motion.coordinates.physical(theta)
+
+    @property
+    def feature_count(self) -> int:
+        return len(self.features)
+
+    @property
+    def learner_outputs(self) -> int:
+        return max(sum(map(len, self.motion.learned)), 1)
+
+    @property
+    def layout(self) -> tuple[SignalName, ...]:
+        """Names of states, then inputs."""
+        return layout_of(self.motion)
+
+    used = layout
+
+    def physics_alone(self) -> MotionProblem:
+        """Return the problem without a learner, whose inputs take no rows from a motion."""
+        return self
+
+    def without_learner(self) -> MotionProblem:
+        """Return the problem with no state and no output learned."""
+        states = tuple(replace(state, learned=False) for state in self.motion.states)
+        outputs = tuple(replace(output, learned=False) for output in self.motion.outputs)
+        return replace(self, motion=replace(self.motion, states=states, outputs=outputs))
+
+    def on(self, record: Record) -> MotionProblem:
+        return replace(self, record=record)
+
+    @property
+    def poser(self) -> Callable[[Record], MotionProblem]:
+        return self.on
 
 
-def regressor_of(
-    baseline: Baseline,
-    lags: Lags | None,
-    learner_inputs: tuple[str, ...] | None,
-    outputs: tuple[str, ...],
-    inputs: tuple[str, ...],
-) -> tuple[Layout, Features]:
-    """Return the regressor of the whole model, and the learner's features of it.
+def pose_motion(
+    record: Record,
+    motion: Motion,
+    learner_inputs: Sequence[str] | None = None,
+    output_weights: str | Sequence[float] = "auto",
+    memory: LearnerStates = LearnerStates(),  # noqa: B008  (frozen)
+) -> MotionProblem:
+    """Check record and motion against each other.
+
+    Args:
+        learner_inputs: expressions of states and inputs that the learner sees; None for all of
+            them.
+        memory: states of the learner's own, which are added to the motion.
 
     Raises:
-        InputError: unknown channels, outputs at lag 0, learner inputs that cannot be read.
+        InputError: other channels, outputs that do not move, learner inputs that cannot be,
+            equations that have no value at the start, a sampling time too long for the fastest
+            mode.
     """
-    chosen = (
-        in_order(baseline.lags, outputs, inputs) if lags is None else lags.layout(outputs, inputs)
+    inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
+    motion = motion.sampled(record.sampling_time)
+    motion.check_channels(inputs, outputs)
+    if not record.even:
+        motion.check_paced(record)
+    motion, learner_inputs = add_memory(motion, learner_inputs, memory, record)
+    record.check_measured()
+    check_output_weights(output_weights, len(outputs))
+    for i, name in enumerate(outputs):
+        if (
+            min(np.ptp(e.outputs[:, i]) for e in record.experiments)
+            == max(np.ptp(e.outputs[:, i]) for e in record.experiments)
+            == 0.0
+        ):
+            raise InputError(
+                f"channel '{name}' is constant over all training data; nothing can be learned "
+                "from it."
+            )
+    deviation = np.concatenate([e.outputs for e in record.experiments]).std(axis=0)
+    deviation = np.where(deviation > 0, deviation, 1.0)
+    problem = MotionProblem(
+        record=record,
+        motion=motion,
+        features=_features(motion, learner_inputs),
+        deviation=deviation,
+        weight=weigh_outputs(output_weights, deviation),
     )
-    features = Features.of(chosen)
-    if learner_inputs is not None:
-        constants = dict(baseline.constants)
-        try:
-            expressions = [parse(text, constants) for text in learner_inputs]
-            for expression in expressions:
-                in_order(expression.lags, outputs, inputs)
-        except InputError as error:
-            raise InputError(f"learner input: {error}") from None
-        features = Features(tuple(expressions))
-    if baseline.function is not None:  # it takes the regressor exactly as `lags` orders it
-        if lags is None:
-            raise InputError(
-                "a baseline function needs `lags`: they define the regressor x that it is "
-                "called with."
-            )
-        missing = set(features.lags) - set(chosen)
-        if missing:
-            raise InputError(
-                f"the learner inputs use {', '.join(map(str, missing))}, which `lags` does not "
-                "contain."
-            )
-        return chosen, features
-    return in_order((*chosen, *features.lags, *baseline.lags), outputs, inputs), features
+    check_start(problem)
+    return problem
 
 
-def check_moving(extent: Extent, record: Record, layout: Layout) -> None:
-    """Raise InputError for a channel of the model that is constant.
-
-    `extent` is that of outputs, then inputs.
-    """
-    used = {lag.channel for lag in layout} | {channel.name for channel in record.outputs}
-    for channel, low, high in zip(record.channels, *extent, strict=True):
-        if channel.name in used and low == high:
-            raise InputError(
-                f"channel '{channel.name}' is constant ({low:g}) over all training data; "
-                "nothing can be learned from it. Remove it, or use data in which it moves."
-            )
-
-
-def check_sizes(deviation: Vector, moved: Vector) -> None:
-    """Raise InputError for outputs whose squares double precision cannot represent.
-
-    `moved` is the range of each output (ny,).
-    """
-    moves = moved > 0
-    if not np.all(np.isfinite(deviation)) or np.any(
-        moves & ((deviation > _LARGEST) | (deviation < 1 / _LARGEST))
-    ):
+def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
+    signals = {*motion.names_of_states, *motion.inputs} - {*motion.visible}
+    known = {
+        name: value
+        for name, value in motion.known.items()
+        if name not in motion.names and name not in signals
+    }
+    reach = {
+        name for name, expression in motion.definitions if set(expression.names) & set(motion.names)
+    }
+    texts = motion.visible if texts is None else tuple(texts)
+    if not texts:
         raise InputError(
-            f"the outputs move by {np.max(moved):.3g}, too large or too small for double precision "
-            "arithmetic; scale them (`scale` of the channel)."
+            "the learner has no inputs; give `inputs` such as a state's name, or leave the key "
+            "out for all."
         )
-
-
-def check_physics(
-    phi: np.ndarray, known: np.ndarray, baseline: Baseline, rows: UsableRows, record: Record
-) -> None:
-    """Raise InputError where Φ (N, ny, nθ), the fixed terms (N, ny) or their squares overflow."""
-    for j, name in enumerate(baseline.names):
-        texts = (
-            ", ".join(t.regressor for t in baseline.terms if t.parameter == name)
-            or "the baseline function"
-        )
-        _check_finite(phi[:, :, j], f"the regressor of {name} ({texts})", rows, record)
-        size = np.abs(phi[:, :, j]).max()
-        if size > _LARGEST or 0 < size < 1 / _LARGEST:
+    found = []
+    for text in texts:
+        expression = parse_named(text, known, "learner input")
+        hidden = [name for name in expression.names if name in reach]
+        if hidden:
             raise InputError(
-                f"the regressor of {name} ({texts}) is of size {size:.3g}, beyond double "
-                "precision arithmetic; scale its channels (`scale`)."
+                f"learner input = {text}: '{hidden[0]}' contains parameters; use states and inputs."
             )
-    _check_finite(known, "the sum of the fixed terms", rows, record)
-
-
-def _check_finite(values: np.ndarray, what: str, rows: UsableRows, record: Record) -> None:
-    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-    if not bad.size:
-        return
-    row = int(bad[0])
-    for experiment in record.experiments:
-        usable = len(experiment) - rows.start
-        if row < usable:
-            raise InputError(f"{experiment.where(row + rows.start)}: {what} is not finite there.")
-        row -= usable
+        found.append(expression)
+    return tuple(found)

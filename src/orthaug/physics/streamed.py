@@ -9,9 +9,9 @@ at the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -24,18 +24,11 @@ from orthaug.data.regressors import Features, Layout, UsableRows, lag_matrix, la
 from orthaug.data.sources import Partition, Source
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import excitation, require_rank
+from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.output_weights import OutputWeights, weigh_outputs
-from orthaug.physics.problem import (
-    Extent,
-    Moments,
-    Problem,
-    check_moving,
-    check_physics,
-    check_sizes,
-    feature_rows,
-    pose,
-)
+from orthaug.physics.problem import Problem, pose
 from orthaug.physics.projection import Projection, powers_of_two
+from orthaug.physics.row_checks import check_moving, check_physics, check_sizes, feature_rows
 
 Passes = Callable[[Callable[[Partition], Any], Sequence[Partition]], list[Any]]
 """`[function(partition) for partition in partitions]`, wherever that is done."""
@@ -249,7 +242,7 @@ class RowBuilder:
             )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StreamedProblem(Problem):
     """A problem of a source.
 
@@ -267,6 +260,8 @@ class StreamedProblem(Problem):
     """θ̂ of physics alone and its coordinates QᵀY."""
     moments: Moments
     freedom: Vector
+
+    streamed: ClassVar[bool] = True
 
     def __repr__(self) -> str:
         return super().__repr__().replace(f"{len(self.rows)} rows", f"{self.count} rows", 1)
@@ -398,13 +393,13 @@ def _factorise(
     basis = replace(basis, turn=back)
     theta = inverse @ (coordinates + back @ rest)
     phi, _ = seen.baseline.on(seen.rows.x, seen.layout, seen.outputs)
-    fields = {name: getattr(seen, name) for name in Problem.__dataclass_fields__}
-    fields |= {
+    own = {field.name: getattr(seen, field.name) for field in fields(Problem)}
+    own |= {
         "projection": Projection(turn @ r, scale, weight.rows(phi), basis.rows(phi)),
         "excitation": excited,
     }
     return StreamedProblem(
-        **fields,
+        **own,
         source=source,
         passes=passes,
         survey=survey,

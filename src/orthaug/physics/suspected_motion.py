@@ -94,6 +94,20 @@ class SuspectedMotion(Motion):
         return self._with_terms(outputs, len(self.states), (x, u, p), xp)
 
     @property
+    def held(self) -> tuple[str, ...]:
+        return self._known.held
+
+    @property
+    def discrete_states(self) -> tuple[str, ...]:
+        return self._known.discrete_states
+
+    def control(self, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        return self._known.control(y, x, u[: len(self._known.external)], p[: self._count], xp)
+
+    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+        return self._known.after_sample(following, y, x, u[: self._own], p[: self._count], xp)
+
+    @property
     def _known(self) -> Motion:
         assert self.physics is not None
         return self.physics

@@ -12,8 +12,8 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.lines import plain_number, plural
-from orthaug.reports.findings import SuspectResult
-from orthaug.reports.result import ParameterResult
+from orthaug.analysis.findings import SuspectResult
+from orthaug.analysis.fit_findings import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200

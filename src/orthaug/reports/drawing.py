@@ -71,13 +71,17 @@ def axes_for(ax: Axes | None) -> Axes:
     check_type(ax, Axes | None, "ax", "axes of matplotlib, or None")
     if ax is not None:
         return ax
+    return rule_axes(new_figure(SIZE[0], SIZE[1] + TOP + BOTTOM).add_subplot())
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return a figure [inches]: of pyplot where that is in use, for notebooks to show."""
     made: Callable[..., Figure] = Figure
     if "matplotlib.pyplot" in sys.modules or "ipykernel" in sys.modules:
         from matplotlib import pyplot
 
         made = pyplot.figure
-    figure = made(figsize=(SIZE[0], SIZE[1] + TOP + BOTTOM), layout="constrained")
-    return rule_axes(figure.add_subplot())
+    return made(figsize=(width, height), layout="constrained")
 
 
 def rule_axes(axis: Axes) -> Axes:
@@ -175,7 +179,7 @@ def window(response: Response) -> tuple[np.ndarray, slice]:
     """Return the instants [s] and the rows that a figure shows of the first experiment."""
     trajectory = response.trajectories[0]
     rows = slice(trajectory.start, min(trajectory.start + _WINDOW, len(trajectory.model)))
-    return np.arange(rows.start, rows.stop) * response.sampling_time, rows
+    return trajectory.time(response.sampling_time)[rows], rows
 
 
 def legend(axis: Axes, *shown: Any) -> None:

@@ -2,47 +2,14 @@
 
 from __future__ import annotations
 
+from orthaug._base.content import Flag, Number, Whole
+from orthaug._base.errors import Warning
 from orthaug._base.lines import fold, percent, table
-from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.findings import MemoryResult
+from orthaug.analysis.findings import MemoryResult
 from orthaug.reports.result import ResultHeader
+from orthaug.selection.explanation import ExplainingTerm, MovedParameter, SingleTerm
 
 _MEMORY = 5  # terms with memory that the text lists
-
-
-class ExplainingTermResult(Content):
-    """A term to add to the physics."""
-
-    parameter: str
-    expression: str
-    kind: str
-    on: str | None
-    width: Number
-    added_to: str
-    coefficient: Number
-    unit: str | None
-    std: Number
-    share: Number
-    alone: Number
-    rivals: list[str]
-
-
-class SingleTermResult(Content):
-    """A term as the only one."""
-
-    name: str
-    expression: str
-    added_to: str
-    share: Number
-
-
-class MovedParameterResult(Content):
-    """A parameter now, and with the terms in the physics."""
-
-    name: str
-    unit: str
-    value: Number
-    value_with: Number
 
 
 class ExplainResult(ResultHeader):
@@ -53,13 +20,13 @@ class ExplainResult(ResultHeader):
     noise: Number
     p: Number
     points: Whole
-    terms: list[ExplainingTermResult]
-    singles: list[SingleTermResult]
-    parameters: list[MovedParameterResult]
+    terms: list[ExplainingTerm]
+    singles: list[SingleTerm]
+    parameters: list[MovedParameter]
     spec: str | None
     text: str
     memory: list[MemoryResult] = []
-    warnings: list[WarningResult]
+    warnings: list[Warning]
 
 
 def explain_text(result: ExplainResult) -> str:
@@ -103,7 +70,7 @@ def _term_lines(result: ExplainResult) -> list[str]:
             _percent(term.alone),
         )
         rows.append([term.expression, *numbers, term.added_to])
-    lines = table(rows)
+    lines = table(rows, drop=["alone", "unit"])
     for term in result.terms:
         if term.rivals:
             lines.append(f"nearly as well instead of {term.expression}: {', '.join(term.rivals)}")

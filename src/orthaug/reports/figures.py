@@ -5,19 +5,34 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import check_choice, check_type
 from orthaug._base.errors import InputError
+from orthaug._base.lines import estimate_cells
 from orthaug.analysis.linear_view import Linearization
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.fitting.recursive import Recursive
 from orthaug.models.response import Response
-from orthaug.reports.drawing import BLUE, GREEN, GREY, ORANGE, Axes, Figure, axes_for, outline
+from orthaug.reports.drawing import (
+    BLUE,
+    BOTTOM,
+    GREEN,
+    GREY,
+    ORANGE,
+    SIZE,
+    TOP,
+    Axes,
+    Figure,
+    axes_for,
+    new_figure,
+    outline,
+    rule_axes,
+)
 from orthaug.reports.learned_part import LearnedPart, curve_limits, learned_of
 from orthaug.reports.linear import gain_unit
 from orthaug.reports.result import CheckResult, CompareResult, FitResult
@@ -111,17 +126,51 @@ def _draw(what: Any, kind: str, title: str | None) -> Figure:
 
 @dataclass(frozen=True)
 class FitPlots:
-    """Figures of `fit`. Each draws on `ax`, or on new axes, and returns the axes.
+    """Figures of `fit`: `plot()` is an overview, `plot.free_run()` and so on are single ones.
 
-    Settings of matplotlib stay as they are. New axes belong to pyplot where that is in use, as in
-    notebooks.
+    Each of these draws on `ax`, or on new axes, and returns the axes. Settings of matplotlib stay
+    as they are. New axes belong to pyplot where that is in use, as in notebooks.
     """
 
-    fit: Estimate | MotionEstimate
+    fit: Estimate
 
     def __repr__(self) -> str:
-        verbs = [name for name in vars(type(self)) if not name.startswith("_") and name != "fit"]
-        return f"FitPlots({', '.join(f'{verb}()' for verb in verbs)})"
+        return f"FitPlots({', '.join(f'{kind}()' for kind in dir(self))})"
+
+    def __dir__(self) -> list[str]:
+        """Return the kinds of figures, which completion lists."""
+        return sorted(n for n in vars(type(self)) if not n.startswith("_") and n != "fit")
+
+    def __call__(self, record: Record | None = None) -> Figure:
+        """Return an overview: free run and its residual, parameters, and the learned part.
+
+        Without a learner the gain over frequency is in the place of the learned part, if the model
+        has inputs and a point of rest.
+
+        Args:
+            record: that of the free run, with the model's channels; None for that of training.
+
+        Raises:
+            InputError: a fit without a usable model, other channels.
+        """
+        learns = self.fit.learns
+        figure = new_figure(2 * SIZE[0], 2 * (SIZE[1] + TOP + BOTTOM))
+        axes = figure.subplot_mosaic([["run", "run"], ["residual", "residual"], ["left", "right"]])
+        for axis in axes.values():
+            rule_axes(axis)
+        self.free_run(record, ax=axes["run"])
+        if self.fit.model.fitting(self._record(record), need_outputs=False).outputs:
+            self.residuals(record, kind="free_run", ax=axes["residual"])
+            axes["residual"].sharex(axes["run"])
+        else:
+            axes["residual"].remove()
+        self.parameters(ax=axes["left"])
+        try:
+            (self.learned if learns else self.bode)(ax=axes["right"])
+        except InputError as error:  # no learned part, no inputs, or no point of rest
+            axes["right"].set_axis_off()
+            axes["right"].text(0.5, 0.5, fill(str(error), 40), ha="center", va="center")
+        return figure
 
     def free_run(
         self,
@@ -148,7 +197,7 @@ class FitPlots:
                 experiment
             ]
             limits = axis.get_ylim()
-            time = np.arange(len(alone.model)) * response.sampling_time
+            time = alone.time(response.sampling_time)
             drawn = outline(time, alone.model[:, i])
             axis.plot(
                 *drawn, color=ORANGE, linewidth=0.9, zorder=1.5, label="model without its learner"
@@ -197,7 +246,7 @@ class FitPlots:
         axis = axes_for(ax)
         error = trajectory.measured[:, i] - trajectory.model[:, i]
         axis.plot(
-            *outline(np.arange(len(error)) * response.sampling_time, error),
+            *outline(trajectory.time(response.sampling_time), error),
             color=BLUE,
             linewidth=0.7,
         )
@@ -286,8 +335,9 @@ class FitPlots:
             if known and row["value"]:
                 share = 100 * (ends - row["value"]) / abs(row["value"])
                 axis.plot(share, [y, y], "|-", color=GREEN, markersize=10, linewidth=2)
-            reach = f"  [{ends[0]:.5g}, {ends[1]:.5g}]" if known else ", no interval"
-            label = f"{name} = {row['value']:.6g}{' ' * bool(row['unit'])}{row['unit']}{reach}"
+            value, _, low, high = estimate_cells(row["value"], row["std"], ends.tolist())
+            reach = f"  [{low}, {high}]" if known else ", no interval"
+            label = f"{name} = {value}{' ' * bool(row['unit'])}{row['unit']}{reach}"
             axis.plot(
                 [0.0],
                 [y],
@@ -385,7 +435,7 @@ class FitPlots:
             response.outputs[i],
             axes_for(ax),
         )
-        time = np.arange(len(trajectory.model)) * response.sampling_time
+        time = trajectory.time(response.sampling_time)
         if trajectory.measured is not None:
             axis.plot(
                 *outline(time, trajectory.measured[:, i]),

@@ -1,4 +1,4 @@
-"""Figures of findings: tests of residuals, and biases by suspected terms."""
+"""Figures of findings: tests of residuals, biases by suspected terms, and rehearsals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.lines import percent
+from orthaug._base.lines import cut, percent
+from orthaug.analysis.findings import SuspectResult
+from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.reports.biases import bias_map
 from orthaug.reports.drawing import (
     BLACK,
@@ -16,6 +18,7 @@ from orthaug.reports.drawing import (
     CYCLE,
     GREEN,
     GREY,
+    ORANGE,
     RIGHT,
     SIZE,
     TOP,
@@ -26,9 +29,8 @@ from orthaug.reports.drawing import (
     label,
     plain,
 )
-from orthaug.reports.findings import SuspectResult
 from orthaug.reports.page_blocks import regressor_label, with_unit
-from orthaug.reports.residual_tests import ResidualTestResult
+from orthaug.reports.recovery import RecoverResult, relative_errors
 
 _UPRIGHT = 11  # letters of a name that fit above one cell
 _CELL = 0.8  # inches
@@ -135,3 +137,44 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
 def _floats(values: Sequence[Any]) -> np.ndarray:
     """Return the numbers of a result, NaN for None."""
     return np.array(values, dtype=float)
+
+
+@plain
+def recovery_figure(result: RecoverResult) -> Figure:
+    """Draw each parameter's estimates and intervals over the draws, in errors of its true value.
+
+    Draws with the same term are side by side.
+    """
+    names = [row.name for row in result.parameters]
+    order = sorted(range(len(result.outcomes)), key=lambda i: (result.outcomes[i].term, i))
+    figure = Figure(figsize=(SIZE[0] * 1.3, TOP + 1.7 * len(names) + 1.1))
+    axes = grid(figure, len(names), 1, bottom=BOTTOM + 1.1, gap=(0.42, 0.5), sharex=True)
+    headline(figure, f"rehearsal: {result.draws} draws with a known truth")
+    place = np.arange(len(order))
+    for axis, row in zip(axes[:, 0], result.parameters, strict=True):
+        value, plain_limits, wide = (part[order] for part in relative_errors(result, row.name))
+        axis.axhline(0.0, color=BLACK, linewidth=0.8)
+        ends = 100 * wide
+        axis.vlines(place, *ends.T, color=GREY, linewidth=5, label="with the bias")
+        missed = ~((plain_limits[:, 0] <= 0) & (plain_limits[:, 1] >= 0))
+        for own, colour, marker, words in (
+            (~missed, BLUE, "o", "interval holds the truth"),
+            (missed, ORANGE, "s", "interval misses it, or there is none"),
+        ):
+            ends = 100 * plain_limits[own]
+            axis.vlines(place[own], ends[:, 0], ends[:, 1], color=colour, linewidth=1.6)
+            at = place[own], 100 * value[own]
+            axis.plot(*at, marker, color=colour, markersize=3.5, label=words)
+        held = f"{row.held} of {row.shown} hold the truth, {row.held_with_bias} with the bias"
+        axis.set_title(f"{row.name}: {held}", fontsize=9, loc="left", fontweight="bold")
+        label(axis, y="error [%]")
+    terms = [result.outcomes[i].term for i in order]
+    first = [k for k, term in enumerate(terms) if k == 0 or term != terms[k - 1]]
+    for axis in axes[:, 0]:
+        for k in first[1:]:
+            axis.axvline(k - 0.5, color=GREY, linewidth=0.5)
+    short = [cut(terms[k], 26) for k in first]
+    axes[-1, 0].set_xticks(first, short, rotation=30, ha="right", fontsize=7)
+    drawn, words = axes[0, 0].get_legend_handles_labels()
+    figure.legend(drawn, words, fontsize=7, ncols=3, frameon=False, loc="lower center")
+    return figure

@@ -10,13 +10,13 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from orthaug._base.lines import estimate_rows
+from orthaug.analysis.fit_findings import Findings
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.motion_estimates import MotionEstimate
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
-from orthaug.reports.result import FitResult
 
 # Colours are the notebook's own, so that a card is read on light and on dark.
 _TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
@@ -163,8 +163,7 @@ def _motion(motion: Motion) -> Card:
 
 
 @card_of.register(Estimate)
-@card_of.register(MotionEstimate)
-def _fit_card(fit: Estimate | MotionEstimate) -> Card:
+def _fit_card(fit: Estimate) -> Card:
     status = fit.status
     facts = {
         "structure": fit.model.structure,
@@ -174,15 +173,13 @@ def _fit_card(fit: Estimate | MotionEstimate) -> Card:
         f"{status.loss:.6g}",
         "": status.message or "",
     }
+    found = fit.parameters.to_dict("index")
+    cells = estimate_rows(
+        (row["value"], row["std"], (row["ci95_low"], row["ci95_high"])) for row in found.values()
+    )
     rows = [
-        [
-            name,
-            _number(row["value"]),
-            _number(row["std"], 3),
-            _interval(row["ci95_low"], row["ci95_high"]),
-            row["unit"] or "–",
-        ]
-        for name, row in fit.parameters.to_dict("index").items()
+        [str(name), *map(_compact, own), row["unit"] or "–"]
+        for (name, row), own in zip(found.items(), cells, strict=True)
     ]
     parameters = Table(["parameter", "value", "std", "95 % interval", "unit"], rows)
     return Card(
@@ -190,20 +187,22 @@ def _fit_card(fit: Estimate | MotionEstimate) -> Card:
     )
 
 
-def card_of_result(fit: Estimate | MotionEstimate, result: FitResult) -> Card:
+def card_of_result(fit: Estimate, result: Findings) -> Card:
     """Return the card of a fit with the findings on every parameter, and all warnings."""
     parameters = [*result.parameters, *(result.physical_parameters or ())]
     columns = ["parameter", "value", "std", "95 % interval", "unit"]
+    cells = estimate_rows((row.value, row.std, row.ci95) for row in parameters)
     rows = [
-        [row.name, _number(row.value), _number(row.std, 3), _ends(row.ci95), row.shown_unit]
-        for row in parameters
+        [row.name, *map(_compact, own), row.shown_unit]
+        for row, own in zip(parameters, cells, strict=True)
     ]
     if any(row.bias for row in parameters):
         columns += ["bias", "95 % interval with it"]
-        for cells, row in zip(rows, parameters, strict=True):
+        wider = estimate_rows((row.value, None, row.ci95_with_bias) for row in parameters)
+        for own, row, (*_, reach) in zip(rows, parameters, wider, strict=True):
             known = row.bias is None or row.bias.determined
-            shown = _ends(row.ci95_with_bias) if known else "not determined"
-            cells += [_number(row.bias.value if row.bias else None, 3), shown]
+            shown = _compact(reach) if known else "not determined"
+            own += [_number(row.bias.value if row.bias else None, 3), shown]
     notes = [warning.text for warning in result.warnings]
     return replace(card_of(fit), tables=[Table(columns, rows)], notes=notes)
 
@@ -254,8 +253,9 @@ def _bounds(low: float, high: float) -> str:
     return f"≥ {low:g}" if np.isfinite(low) else f"≤ {high:g}" if np.isfinite(high) else "–"
 
 
-def _ends(interval: Sequence[Any] | None) -> str:
-    return "–" if interval is None else _interval(*interval)
+def _compact(cell: str) -> str:
+    """Return a cell without the spaces that align it in text."""
+    return cell.replace("[ ", "[").replace("  ", " ") if cell.startswith("[") else cell
 
 
 def _interval(low: Any, high: Any) -> str:

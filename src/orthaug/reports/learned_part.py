@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import singledispatch
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,11 +13,12 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.motion_field import labels_of, parts_at
 from orthaug.reports.page_blocks import with_unit
 
 if TYPE_CHECKING:
-    from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.model import Model
     from orthaug.models.moving import MotionDynamics
 
@@ -235,15 +237,29 @@ class LearnedPart:
         return Surface(first, second, learned)
 
 
-def learned_of(fit: Estimate | MotionEstimate, record: Record) -> LearnedPart | None:
+def learned_of(fit: Estimate, record: Record) -> LearnedPart | None:
     """Return the learned part of a fit along a record, with intervals where it has them.
 
     None where nothing was learned.
     """
     if not fit.learns:
         return None
-    if isinstance(fit, Estimate):
-        return LearnedPart.of_lagged(fit.model, record)
+    return _part_of(fit, record)
+
+
+@singledispatch
+def _part_of(fit: Estimate, record: Record) -> LearnedPart:
+    """Return the learned part of a kind of physics."""
+    raise NotImplementedError
+
+
+@_part_of.register(LaggedEstimate)
+def _of_lagged(fit: LaggedEstimate, record: Record) -> LearnedPart:
+    return LearnedPart.of_lagged(fit.model, record)
+
+
+@_part_of.register(MotionEstimate)
+def _of_motion(fit: MotionEstimate, record: Record) -> LearnedPart:
     from orthaug.analysis.learned_part import learned_reach
 
     size = fit.model.form.states
@@ -281,7 +297,8 @@ def trajectory_of(model: Model[MotionDynamics], record: Record) -> tuple[Matrix,
     states = frame[list(model.form.motion.names_of_states)].to_numpy()[: len(first)]
     finite = np.isfinite(states).all(axis=1)
     end = len(states) if finite.all() else max(int(np.argmin(finite)), 1)
-    return states[:end], np.asarray(first.inputs)[:end]
+    rows = model.form.inputs(first, record)[:end]
+    return states[:end], model.form.at_samples(model.numbers, states[:end], rows)
 
 
 def labels_with_units(model: Model[MotionDynamics]) -> list[str]:

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._base.content import ByName, Content, Flag, Number, Numbers, Whole
+from orthaug._base.errors import Warning
 from orthaug.analysis.linear_view import Linearization, LinearView, Pole, phase_of
 from orthaug.analysis.measured_response import MeasuredResponse
-from orthaug.reports.fields import ByName, Content, Flag, Number, Numbers, WarningResult, Whole
 from orthaug.reports.result import ResultHeader
 
 Rows = list[Numbers]
@@ -115,7 +116,7 @@ class LinearPointResult(Content):
     response: list[ResponseResult]
     median_difference_db: Number
     median_difference_deg: Number
-    warnings: list[WarningResult]
+    warnings: list[Warning]
 
 
 class MeasuredPairResult(Content):
@@ -146,7 +147,7 @@ class LinearizeResult(ResultHeader):
     held: str
     points: list[LinearPointResult]
     measured: MeasuredResponseResult | None
-    warnings: list[WarningResult]
+    warnings: list[Warning]
 
     @classmethod
     def of(cls, found: Linearization) -> LinearizeResult:

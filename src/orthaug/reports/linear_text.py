@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.lines import fold, table
+from orthaug._base.lines import estimate_cells, fold, table
 from orthaug.analysis.linear_system import Continuous
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView, Pole
 from orthaug.reports.linear import gain_unit
@@ -76,11 +76,9 @@ def _gains(view: LinearView) -> list[str]:
         return ["static gain: none, because a pole at 1 integrates"]
     rows = [["static gain", "value", "95 % interval", "unit"]]
     for i, j in np.ndindex(*view.gain.shape):
-        interval = _interval(None if view.gain_ci95 is None else view.gain_ci95[i, j])
-        unit = gain_unit(view, i, j)
-        rows.append(
-            [f"{view.outputs[i]} / {view.inputs[j]}", f"{view.gain[i, j]:.6g}", interval, unit]
-        )
+        ends = None if view.gain_ci95 is None else view.gain_ci95[i, j]
+        name, unit = f"{view.outputs[i]} / {view.inputs[j]}", gain_unit(view, i, j)
+        rows.append([name, *_with_interval(float(view.gain[i, j]), ends), unit])
     return table(rows)
 
 
@@ -90,18 +88,17 @@ def _poles(view: LinearView) -> list[str]:
     for pole in view.poles:
         if pole.z.imag < 0:
             continue  # its conjugate is listed
-        hertz = "–" if pole.hertz is None else f"{pole.hertz:.5g} Hz"
+        magnitude = _with_interval(pole.magnitude, pole.magnitude_ci95)
+        hertz, spread = _with_interval(pole.hertz, pole.hertz_ci95)
+        damping, damping_spread = _with_interval(pole.damping, pole.damping_ci95)
         rate = "–" if pole.natural_frequency is None else f"{pole.natural_frequency:.5g} 1/s"
-        damping = "–" if pole.damping is None else f"{pole.damping:.4g}"
-        spans = [
-            _interval(span) for span in (pole.magnitude_ci95, pole.hertz_ci95, pole.damping_ci95)
-        ]
         last = (
-            spans[2] if pole.time_constant is None else f"time constant {pole.time_constant:.5g} s"
+            damping_spread
+            if pole.time_constant is None
+            else f"time constant {pole.time_constant:.5g} s"
         )
-        rows.append(
-            [_z(pole), f"{pole.magnitude:.6g}", spans[0], hertz, spans[1], rate, damping, last]
-        )
+        unit = "" if pole.hertz is None else " Hz"
+        rows.append([_z(pole), *magnitude, f"{hertz}{unit}", spread, rate, damping, last])
     lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
         times = "once" if view.at_zero == 1 else f"{view.at_zero} times"
@@ -134,7 +131,8 @@ def _matrices(view: LinearView) -> list[list[str]]:
 
 
 def _cell(value: float, half: float | None) -> str:
-    return f"{value:.6g}" if not half else f"{value:.6g} ± {half:.2g}"
+    shown, spread, _, _ = estimate_cells(value, half)
+    return shown if not half else f"{shown} ± {spread}"
 
 
 def _continuous(view: LinearView) -> list[str]:
@@ -183,5 +181,7 @@ def _agreement(found: Linearization, view: LinearView) -> list[str]:
     ]
 
 
-def _interval(ends: Any) -> str:
-    return "" if ends is None else f"[{ends[0]:.5g}, {ends[1]:.5g}]"
+def _with_interval(value: float | None, ends: Any) -> list[str]:
+    """Return a value and its interval with equal decimals; no text where there is no interval."""
+    shown, _, low, high = estimate_cells(value, None, ends)
+    return [shown, "" if ends is None else f"[{low}, {high}]"]

@@ -16,7 +16,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from orthaug.reports.fields import WarningResult
+from orthaug._base.errors import Warning
 from orthaug.reports.page_blocks import Plot, Section, plots_of, prose
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_fit import FitPage, Origin, fit_sections
@@ -71,7 +71,7 @@ def _page(
     title: str,
     kind: str,
     verdict: PageVerdict,
-    warnings: Sequence[WarningResult],
+    warnings: Sequence[Warning],
     sections: Sequence[Section],
     origin: Origin,
     judged: str,
@@ -116,6 +116,7 @@ def _figure(plot: Plot) -> dict[str, Any]:
         "height": plot.height,
         "small": plot.small,
         "series": plot.series,
+        "whole": plot.whole,
     }
 
 

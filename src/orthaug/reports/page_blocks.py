@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from orthaug._base import lines
-from orthaug.reports.result import ParameterResult
+from orthaug._base.lines import MOST_DIGITS, digits_for
+from orthaug.analysis.fit_findings import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _ROUNDING = 1e-12  # of its scale: a smaller number is the rounding error of zero
-_MOST_DIGITS = 15
 _MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number of its own
 
 
@@ -49,7 +49,7 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     scale = max(map(abs, known), default=None)
     digits = digits_for(scale, max(known) - min(known), digits) if known else digits
     decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
-    if decimals is None or not 0 < decimals <= _MOST_DIGITS or None in ends:
+    if decimals is None or not 0 < decimals <= MOST_DIGITS or None in ends:
         return " … ".join(number(end, digits, scale) for end in ends)
     texts = [
         f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known
@@ -57,18 +57,6 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     while all(text.endswith("0") for text in texts) and "." in texts[0]:
         texts = [text[:-1].removesuffix(".") for text in texts]
     return " … ".join(texts).replace("-", "−")
-
-
-def digits_for(value: float | None, spread: float | None, least: int) -> int:
-    """Return the digits of a value that show two of its spread, but at least `least`.
-
-    Examples:
-        >>> digits_for(1.45951, 9e-6, 5), digits_for(1.45951, 0.1, 5)
-        (8, 5)
-    """
-    if not value or not spread or not math.isfinite(value / spread):
-        return least
-    return min(max(least, math.ceil(math.log10(abs(value / spread))) + 2), _MOST_DIGITS)
 
 
 def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
@@ -184,6 +172,8 @@ class Plot:
     small: bool = False
     series: Mapping[str, Any] = field(default_factory=dict)
     """Long curves by the name that traces refer to."""
+    whole: tuple[float, float] | None = None
+    """Range of the x axis with all curves, where the plot opens on a part of it."""
 
 
 @dataclass(frozen=True)
@@ -195,11 +185,12 @@ class Grid:
 
 @dataclass(frozen=True)
 class Section:
-    """A chapter of a page."""
+    """A chapter of a page; one that is `folded` shows its title until it is opened."""
 
     key: str
     title: str
     blocks: Sequence[Text | Table | Code | Plot | Grid]
+    folded: bool = False
 
 
 def plots_of(sections: Sequence[Section]) -> list[Plot]:

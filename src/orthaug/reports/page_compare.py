@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from orthaug._base.lines import digits_for
 from orthaug.models.response import Response
-from orthaug.reports.page_blocks import Grid, Section, Table, Text, digits_for, interval, number
+from orthaug.reports.page_blocks import Grid, Section, Table, Text, interval, number
 from orthaug.reports.page_figures import parameter_comparison
 from orthaug.reports.page_fit import (
     BIAS_TOLD,

@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from orthaug.analysis.findings import SuspectResult
+from orthaug.analysis.fit_findings import ParameterResult, PartScores, RestartResult
+from orthaug.analysis.residual_tests import RegressorResult, ResidualTestResult
 from orthaug.reports.biases import bias_map
-from orthaug.reports.findings import SuspectResult
 from orthaug.reports.page_blocks import (
     CATEGORIES,
     Plot,
@@ -21,8 +23,7 @@ from orthaug.reports.page_blocks import (
     round_values,
     with_unit,
 )
-from orthaug.reports.residual_tests import RegressorResult, ResidualTestResult
-from orthaug.reports.result import ParameterResult, PartScores, RestartResult, RowResult
+from orthaug.reports.result import RowResult
 
 _ROW = 62  # pixels of a parameter
 # Height of its name on an axis from -1 to 1: between the numbers of its axis and the last

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.fitting.any_fit import STD_KINDS
+from orthaug._base.lines import digits_for
+from orthaug.analysis.fit_findings import ParameterResult, PartScores
+from orthaug.fitting.estimates import STD_KINDS
 from orthaug.models.response import Response
 from orthaug.reports.biases import biased_by
 from orthaug.reports.learned_part import LearnedPart
@@ -19,7 +21,6 @@ from orthaug.reports.page_blocks import (
     Section,
     Table,
     Text,
-    digits_for,
     interval,
     number,
     percent,
@@ -34,7 +35,7 @@ from orthaug.reports.page_findings import (
 )
 from orthaug.reports.page_learned import learned_blocks
 from orthaug.reports.page_runs import Run, error_band, run_plots
-from orthaug.reports.result import CompareResult, DataResult, FitResult, ParameterResult, PartScores
+from orthaug.reports.result import CompareResult, DataResult, FitResult
 
 BIAS_TOLD = (
     " The bias is the estimate minus the true value, as far as one suspected term explains "
@@ -101,12 +102,14 @@ def fit_sections(page: FitPage) -> list[Section]:
         Section("free-run", "Free run", _runs(page)),
         Section("share", "Physics and learner", _shares(page)),
         Section("learned", "What was learned", _learned_blocks(page)),
-        Section("residuals", "Residual tests", residuals_blocks(result, page.units)),
-        Section("stability", "Stability", stability_blocks(result)),
-        Section("excitation", "Excitation and suspects", excitation_blocks(result)),
-        Section("restarts", "Training and restarts", restarts_blocks(result)),
         Section("scores", "Scores", score_blocks({"": result.scores}, page.outputs, page.units)),
-        Section("reproduce", "How to reproduce it", origin_blocks(page.origin, result)),
+        Section("residuals", "Residual tests", residuals_blocks(result, page.units), folded=True),
+        Section("stability", "Stability", stability_blocks(result), folded=True),
+        Section("excitation", "Excitation and suspects", excitation_blocks(result), folded=True),
+        Section("restarts", "Training and restarts", restarts_blocks(result), folded=True),
+        Section(
+            "reproduce", "How to reproduce it", origin_blocks(page.origin, result), folded=True
+        ),
     ]
     return [section for section in found if section.blocks]
 
@@ -184,6 +187,11 @@ def _noise_model(result: FitResult) -> list[Any]:
         "The noise model D(q) v = C(q) e of the errors v: 1 + ar1 q⁻¹ + … is D, 1 + ma1 q⁻¹ + … is "
         "C. Its coefficients were estimated with the parameters, whose intervals count that. "
     )
+    if any(one.ar is None for one in result.noise):
+        caption = (
+            "The gain K of the one-step predictor x̂⁺ = F(x̂, u) + K (y − ŷ), by which its states "
+            "follow each output. It was estimated with the parameters, whose intervals count that. "
+        )
     caption += " ".join(f"{one.text}." for one in result.noise)
     rows = [
         [
@@ -248,7 +256,7 @@ def _equations(result: FitResult) -> list[Any]:
     """Return the equations of a motion, and the terms that were learned."""
     blocks: list[Any] = []
     declared = result.spec.get("motion")
-    if result.motion is not None and declared:
+    if result.motion is not None and declared and "states" in declared:
         next_value = result.motion.discrete
         rows = [
             [
@@ -330,8 +338,8 @@ def _runs(page: FitPage) -> list[Any]:
         else ""
     )
     how = Text(
-        "Drag to zoom, double-click for the whole record; on the keyboard the arrows move, + "
-        "and − zoom, 0 shows all.",
+        "Drag to zoom, double-click for the first view. Where that is a part of the record, the "
+        "button below shows all. On the keyboard the arrows move, + and − zoom, 0 shows all.",
         "hint",
     )
     return [*notes, Text(text), how, *run_plots(runs, band)]
@@ -375,7 +383,7 @@ def _shares(page: FitPage) -> list[Any]:
         "marker": {"color": "@learner"},
     }
     largest = max((x for x in bars["x"] if x is not None), default=0.0)
-    axis = {"title": {"text": "share of the learner [%]"}, "range": [0, max(100.0, 1.05 * largest)]}
+    axis = {"title": {"text": "share of the learner [%]"}, "range": [0, 1.05 * largest or 100.0]}
     layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
     text = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":

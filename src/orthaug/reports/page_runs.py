@@ -26,6 +26,8 @@ _PANEL = 330  # pixels of a pair of panels
 _DASHES = ("dash", "solid", "dot", "dashdot")
 _MOST_BREAKS = 40  # between experiments that are marked
 _FAR = 3.0  # times the measured range: a curve that leaves it is cut off at the edge of the panel
+_WINDOW = 400  # samples that a plot opens on: single swings are seen
+_MOST_ERROR = 1e6  # squared errors beyond, of a run that goes off, are all alike
 WITHOUT = "model without its learner"  # its label: it is not the physics fitted alone
 
 
@@ -106,6 +108,7 @@ def _comparison_plot(part: str, runs: Mapping[str, Response], most: int) -> Plot
             if panels.measured is not None:
                 panels.add_residual(name, i, model, given)
         panels.finish(i, models)
+    panels.open_on_worst(next(iter(models.values())))
     lost = [name for name, run in runs.items() if any(t.diverged for t in run.trajectories)]
     samples = sum(len(t.model) for t in first.trajectories)
     caption = (
@@ -206,6 +209,16 @@ class _Panels:
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         self.series: dict[str, Any] = {}
         self._left: list[PanelExit] = []
+        self._shown: tuple[float, float] | None = None
+        begins = np.cumsum([0, *(len(t.model) + 1 for t in response.trajectories)])
+        self._lost = next(
+            (
+                int(begin) + t.diverged[0]
+                for begin, t in zip(begins, response.trajectories, strict=False)
+                if t.diverged
+            ),
+            None,
+        )
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
         """Return the name by which traces find the curve of output i."""
@@ -242,15 +255,39 @@ class _Panels:
                 "at the triangle;"
             )
             caption += f" it goes to {reached}."
+        whole = (self.start, self.start + self.step * (self.rows - 1))
+        shown = self._shown
+        if shown is not None:
+            why = "the run diverges" if self._lost is not None else "the error is largest"
+            caption += (
+                f" It opens on {number(shown[0], 4)} to {number(shown[1], 4)} s, where {why}."
+            )
         self.layout["xaxis"] = {
             "title": {"text": time},
-            "range": [self.start, self.start + self.step * (self.rows - 1)],
+            "range": [*(shown or whole)],
             "anchor": f"y{2 * len(self.outputs)}",
         }
         traces = [*self.traces, *(one.marker() for one in self._left)]
+        height = 60 + _PANEL * len(self.outputs)
         return Plot(
-            label, caption, traces, self.layout, 60 + _PANEL * len(self.outputs), series=self.series
+            label,
+            caption,
+            traces,
+            self.layout,
+            height,
+            series=self.series,
+            whole=whole if shown is not None else None,
         )
+
+    def open_on_worst(self, model: Matrix) -> None:
+        """Open on the window in which the model errs most or diverges, where the record is long."""
+        if self.measured is None or self.rows <= 2 * _WINDOW:
+            return
+        first = worst_window(self.measured, model, _WINDOW)
+        if self._lost is not None:
+            first = min(max(self._lost - 3 * _WINDOW // 4, 0), self.rows - _WINDOW)
+        begin = self.start + self.step * first
+        self._shown = (begin, begin + self.step * (_WINDOW - 1))
 
 
 @dataclass(frozen=True)
@@ -281,6 +318,20 @@ class PanelExit:
                 "symbol": "triangle-up" if self.above else "triangle-down",
             },
         }
+
+
+def worst_window(measured: Matrix, model: Matrix, width: int) -> int:
+    """Return the first row of the window of `width` rows with the largest error.
+
+    The errors (N, ny) are squared, over the deviation of each output, and added up; rows without
+    one count nothing.
+    """
+    with np.errstate(all="ignore"):
+        deviation = np.nanstd(measured, axis=0)
+        error = (measured - model) / np.where(deviation > 0, deviation, 1.0)
+        squares = np.nan_to_num(error**2, nan=0.0, posinf=0.0).sum(axis=1)
+    sums = np.cumsum(np.concatenate([[0.0], np.minimum(squares, _MOST_ERROR)]))
+    return int(np.argmax(sums[width:] - sums[:-width]))
 
 
 def frame_of(measured: Vector, curves: Iterable[Vector]) -> list[float] | None:
@@ -342,6 +393,7 @@ def _plot(run: Run, band: Mapping[str, tuple[float, float]], most: int) -> Plot:
                 place = {"xref": "paper", "x0": 0, "x1": 1, "yref": f"y{2 * i + 2}"}
                 panels.layout["shapes"].append(area("@band", **place, y0=low, y1=high))
         panels.finish(i, drawn)
+    panels.open_on_worst(model)
     _mark(panels.layout, run, panels.start, panels.step)
     panels.layout["shapes"] += _shades(response, panels.start, panels.step)
     time = (
@@ -358,7 +410,9 @@ def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) ->
     found = []
     if "measured" in curves:
         line = {"color": "@measured", "width": 3}
-        found.append({"series": f"measured {i}", "name": "measured", "line": line})
+        found.append(
+            {"series": f"measured {i}", "name": "measured", "line": line, "envelope": "area"}
+        )
     if limits is not None:
         edge: dict[str, Any] = {
             "series": f"model {i}",
@@ -374,7 +428,12 @@ def _upper(curves: Sequence[str], i: int, limits: tuple[float, float] | None) ->
         line = {"color": "@physics", "width": 1.3, "dash": "dash"}
         found.append({"series": f"physics {i}", "name": WITHOUT, "line": line})
     found.append(
-        {"series": f"model {i}", "name": "model", "line": {"color": "@model", "width": 1.3}}
+        {
+            "series": f"model {i}",
+            "name": "model",
+            "line": {"color": "@model", "width": 1.3},
+            "envelope": "outline",
+        }
     )
     own = {"yaxis": f"y{2 * i + 1}", "showlegend": i == 0}
     return [{**own, "legendgroup": trace["name"], **trace} for trace in found]

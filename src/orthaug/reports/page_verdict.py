@@ -10,22 +10,15 @@ import numpy as np
 from orthaug._base.lines import plain_number
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
-from orthaug.reports.findings import BiasResult
+from orthaug.analysis.findings import BiasResult
+from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.reports.page_blocks import number, percent
-from orthaug.reports.result import (
-    CompareResult,
-    DataResult,
-    FitResult,
-    ParameterResult,
-    PartScores,
-    RowResult,
-)
+from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
 _SURE = 0.1  # standard error over value up to which a parameter counts as known
 _NAMED = 0.5  # share of the learned part from which its cause is the first advice
-_FAR = 5.0  # standard errors from which the size of a bias is given in figures
 _MOST_DOUBTS = 3  # in the first sentence
 _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
@@ -245,17 +238,15 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         )
     biased = [row.name for row in _rows(result) if _is_biased(row)]
     if biased:
-        one = len(biased) == 1
-        carry = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
         guessed = any(
             row.bias and (row.bias.share or 0.0) < SURE_SHARE
             for row in _rows(result)
             if _is_biased(row)
         )
-        carry = (
-            f"probably {carry}" if guessed and getattr(result, "motion", None) is None else carry
-        )
-        yield f"the estimate{'' if one else 's'} of {_join(biased)} {carry}"
+        probably = guessed and getattr(result, "motion", None) is None
+        size = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
+        verb = "is" if len(biased) == 1 else "are"
+        yield f"{_join(biased)} {verb} {'probably ' * probably}biased{size}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
@@ -283,25 +274,14 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
 
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """Return a text on the size of the biases.
-
-    With figures where one is far larger than its standard error.
-    """
-    one = len(rows) == 1
+    """Return the size of the largest bias: of the value, and in standard errors."""
     worst = max(rows, key=_errors_of)
-    if _errors_of(worst) < _FAR or worst.bias is None:
-        return (
-            "carries a bias larger than its standard error"
-            if one
-            else "carry biases larger than their errors"
-        )
-    share = (
-        ""
-        if not worst.value
-        else f", {percent(abs((worst.bias.value or 0.0) / worst.value))} of its value"
-    )
-    size = f"{plain_number(_errors_of(worst))} standard errors{share}"
-    return f"carries a bias of {size}" if one else (f"carry biases of up to {size} ({worst.name})")
+    if worst.bias is None or worst.bias.value is None:
+        return ""
+    times = f"{float(plain_number(_errors_of(worst))):,g} times its standard error"
+    share = percent(worst.bias.value / worst.value, signed=True) if worst.value else ""
+    size = f"{share}, {times}" if share else times
+    return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
 
 
 def _errors_of(row: ParameterResult) -> float:
@@ -425,8 +405,8 @@ def _option(result: FitResult) -> str | None:
         return "data over the range that the free run leaves"
     if _has_warning(result, "closed_loop"):
         return (
-            "data with the reference recorded, with larger motions of the reference, or "
-            "without the controller"
+            "data with the reference recorded and the loop simulated (`controller`), with larger "
+            "motions of the reference, or without the controller"
         )
     if _is_undecided(result):
         return (

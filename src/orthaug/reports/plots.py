@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthaug.data.record import Record
+from orthaug.data.record import Record, instants_of
 from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import MotionDynamics
@@ -96,7 +96,7 @@ def residual_figure(response: Response, title: str) -> Figure:
         response, f"{title}: {extent(response, slice(trajectory.start, len(trajectory.model)))}"
     )
     assert trajectory.measured is not None
-    time = np.arange(len(trajectory.model)) * response.sampling_time
+    time = trajectory.time(response.sampling_time)
     for i, (axis, channel) in enumerate(zip(axes, response.outputs, strict=True)):
         residual = trajectory.measured[:, i] - trajectory.model[:, i]
         axis.plot(*outline(time, residual), color=BLUE, linewidth=0.6)
@@ -139,7 +139,7 @@ def states_figure(model: Model[MotionDynamics], record: Record, title: str) -> F
     states, _ = trajectory_of(model, record)
     motion = model.form.motion
     rows = slice(0, min(len(states), 250))
-    time = np.arange(rows.stop) * model.sampling_time
+    time = instants_of(len(states), model.sampling_time, record.experiments[0].steps)[rows]
     figure, axes = _stack_panels(len(motion.states), f"{title}: samples 0 to {rows.stop - 1}")
     for axis, state, values in zip(axes, motion.states, states.T, strict=True):
         axis.plot(time, values[rows], color=BLUE, linewidth=1.1)
@@ -155,7 +155,7 @@ def parts_figure(model: Model[MotionDynamics], record: Record, title: str) -> Fi
     rows = slice(0, min(len(states), 250))
     physics, learner = parts_at(model.form, model.numbers, states[rows], inputs[rows])
     names = labels_with_units(model)
-    time = np.arange(rows.stop) * model.sampling_time
+    time = instants_of(len(states), model.sampling_time, record.experiments[0].steps)[rows]
     figure, axes = _stack_panels(2 * len(names), f"{title}: samples 0 to {rows.stop - 1}")
     for i, name in enumerate(names):
         axes[2 * i].plot(time, physics[:, i], color=BLUE, linewidth=1.1, label="physics")

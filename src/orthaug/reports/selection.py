@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from orthaug._base.lines import fold
-from orthaug.reports.fields import Content, Flag, IntervalsResult, Number, WarningResult, Whole
+from orthaug._base.content import Content, Flag, Number, Whole
+from orthaug._base.errors import Warning
+from orthaug._base.lines import estimate_cells, fold, table
+from orthaug.inference.chosen_terms import Intervals
 from orthaug.reports.result import DataResult, ResultHeader
+from orthaug.selection.orders import Delay, Orders
 
 _SHOWN = 12  # models of a stage in the text
 _EXPLAINED = (
@@ -16,23 +19,6 @@ _EXPLAINED = (
     "p, q: of the term on rows that were not used for the choice, and the rate of false "
     "discoveries among the chosen ones.",
 )
-
-
-class OrdersResult(Content):
-    """The orders that were chosen, of each input."""
-
-    na: Whole
-    nb: list[Whole]
-    nk: list[Whole]
-
-
-class DelayResult(Content):
-    """The delay of an input in samples, by three estimates."""
-
-    input: str
-    correlation: int | None
-    fitted: int | None
-    square: int | None = None
 
 
 class NonlinearityResult(Content):
@@ -92,20 +78,20 @@ class SelectResult(ResultHeader):
     """The result of `orthaug select`."""
 
     data: DataResult
-    orders: OrdersResult
-    delays: list[DelayResult]
+    orders: Orders
+    delays: list[Delay]
     nonlinearity: NonlinearityResult | None
     learner: dict[str, Any] | None
     focus: str
     terms: list[TermShareResult] | None
-    intervals: IntervalsResult
+    intervals: Intervals
     level: Number
     physics: list[ShiftResult] | None = None
     condition: Number = None
     models: list[SelectionRowResult]
     seconds: Number
     stopped: Flag
-    warnings: list[WarningResult]
+    warnings: list[Warning]
 
 
 def selection_text(result: SelectResult) -> str:
@@ -123,16 +109,11 @@ def selection_text(result: SelectResult) -> str:
     lines.append(f"learner      {_learner(result)}")
     lines.append(f"intervals    {result.intervals.source}: {result.intervals.text}")
     if result.terms:
-        width = max(len(term.term) for term in result.terms)
-        lines += [
-            "",
-            f"{'term':<{width}}  {'chosen':>6}  {'left':>6}  {'rate':>8}  {'p':>8}  {'q':>8}",
-        ]
-        lines += [
-            f"{t.term:<{width}}  {_percent(t.chosen):>6}  {_percent(t.left):>6}  "
-            f"{_p_text(t.rate)}  {_p_text(t.p)}  {_p_text(t.q)}"
+        rows = [
+            [t.term, _percent(t.chosen), _percent(t.left), *map(_p_text, (t.rate, t.p, t.q))]
             for t in result.terms
         ]
+        lines += ["", *table([["term", "chosen", "left", "rate", "p", "q"], *rows])]
         lines += ["", *_EXPLAINED]
         lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
@@ -143,7 +124,7 @@ def selection_text(result: SelectResult) -> str:
 
 
 def _p_text(p: float | None) -> str:
-    return f"{'–' if p is None else f'{p:.2g}':>8}"
+    return "–" if p is None else f"{p:.2g}"
 
 
 def _percent(share: float | None) -> str:
@@ -156,28 +137,24 @@ def _physics(result: SelectResult) -> list[str]:
     """Return the table of parameters, of physics alone and with the terms."""
     if not result.physics:
         return []
-    width = max(9, *(len(shift.parameter) for shift in result.physics))
-    lines = [
-        "",
-        f"{'parameter':<{width}}  {'physics alone':>22}  {'with the terms':>22}  {'left':>6}",
-    ]
+    rows = [["parameter", "physics alone", "with the terms", "left", ""]]
     for shift in result.physics:
-        before, after = (
-            _figure(shift.before, shift.before_std),
-            _figure(shift.after, shift.after_std),
-        )
-        mark = "  moves by more than its standard errors allow" if shift.moved else ""
-        lines.append(
-            f"{shift.parameter:<{width}}  {before:>22}  {after:>22}  "
-            f"{_percent(shift.left):>6}{mark}"
+        rows.append(
+            [
+                shift.parameter,
+                _figure(shift.before, shift.before_std),
+                _figure(shift.after, shift.after_std),
+                _percent(shift.left),
+                "moves beyond its std" if shift.moved else "",
+            ]
         )
     condition = "infinite" if result.condition is None else f"{result.condition:.3g}"
-    return [*lines, f"condition number of physics and terms together: {condition}"]
+    return ["", *table(rows), f"condition number of physics and terms together: {condition}"]
 
 
 def _figure(value: float | None, std: float | None) -> str:
-    shown = "–" if value is None else f"{value:.4g}"
-    return shown if std is None else f"{shown} ± {std:.2g}"
+    shown, spread, _, _ = estimate_cells(value, std)
+    return shown if std is None else f"{shown} ± {spread}"
 
 
 def _learner(result: SelectResult) -> str:
@@ -194,15 +171,13 @@ def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:
     chosen = next((i for i, row in enumerate(rows) if row.chosen), 0)
     first = max(0, min(chosen - _SHOWN // 2, len(rows) - _SHOWN))
     shown = rows[first : first + _SHOWN]
-    lines = [f"{stage:<8} {'size':>5}  {'error':>11}  {'std. error':>10}  {'s':>6}"]
-    if len(rows) > len(shown):
-        lines[0] += f"   {len(shown)} of {len(rows)} models"
+    cells = [[stage, "size", "error", "std. error", "s", "model"]]
     for row in shown:
         score = "runs away" if row.score is None else f"{row.score:.5g}"
         error = "–" if row.standard_error is None else f"{row.standard_error:.2g}"
-        mark = "→" if row.chosen else " "
-        lines.append(
-            f"{mark:<8} {row.size:5d}  {score:>11}  {error:>10}  {row.seconds or 0:6.1f}   "
-            f"{row.model}"
-        )
+        mark = "→" if row.chosen else ""
+        cells.append([mark, str(row.size), score, error, f"{row.seconds or 0:.1f}", row.model])
+    lines = table(cells, drop=["s"])
+    if len(rows) > len(shown):
+        lines.append(f"{len(shown)} of {len(rows)} models are shown.")
     return lines

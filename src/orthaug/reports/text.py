@@ -7,18 +7,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orthaug._base.lines import fold, percent, plain_number, table
+from orthaug._base.errors import Warning
+from orthaug._base.lines import (
+    INTERVAL_HEAD,
+    estimate_cells,
+    estimate_rows,
+    fold,
+    percent,
+    plain_number,
+    table,
+)
 from orthaug.analysis.budget import SURE_SHARE
+from orthaug.analysis.findings import SharedResult, SuspectResult
+from orthaug.analysis.fit_findings import Findings, ParameterResult
 from orthaug.reports.biases import biased_by
-from orthaug.reports.fields import WarningResult
-from orthaug.reports.findings import SharedResult, SuspectResult
-from orthaug.reports.page_blocks import digits_for
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
     DesignResult,
     FitResult,
-    ParameterResult,
     RowResult,
     SplitResult,
 )
@@ -27,18 +34,19 @@ if TYPE_CHECKING:
     from orthaug.analysis.validation import Verdict
     from orthaug.data.record import Channel
     from orthaug.fitting.estimates import Estimate
-    from orthaug.fitting.motion_estimates import MotionEstimate
     from orthaug.models.response import Response, Scores
 
 SHOWN = 8  # signals of a design that are listed
+NOISE_ONLY = "95 %, noise only"  # head of intervals that do not count missing physics
 ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
-def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
+def fit_text(fit: Estimate, result: Findings) -> str:
     """Return parameters, scores on every part, residual tests, the verdict and warnings."""
     if not fit.status.ok:
         return ""
-    lines = [_mark_noise_only(line, result) for line in fit.lines()]
+    between = NOISE_ONLY if result.noise_only else INTERVAL_HEAD
+    lines = [_withdraw_claim(line, result) for line in fit.lines(between)]
     blocks = [[w.text.capitalize() for w in result.warnings if w.code == "one_step_only"], lines]
     if result.intervals is not None and result.intervals.source != "none":  # else a warning says it
         blocks.append([f"{result.intervals.text[0].upper()}{result.intervals.text[1:]}"])
@@ -57,17 +65,12 @@ def fit_text(fit: Estimate | MotionEstimate, result: FitResult) -> str:
         parts,
         warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
     ]
-    blocks.append(_advice_lines(result))
+    blocks.append(_advice_lines(result) if isinstance(result, FitResult) else [])
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
-def _mark_noise_only(line: str, result: FitResult) -> str:
-    """Return a line of a fit whose intervals count noise only, without withdrawn claims.
-
-    The line says so.
-    """
-    if result.noise_only:
-        line = line.replace(f"{'95 % interval':^29}", f"{'95 %, noise only':^29}")
+def _withdraw_claim(line: str, result: Findings) -> str:
+    """Return a line of a fit without the claim that a doubt about shared directions withdraws."""
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
         line = (
             f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, "
@@ -148,7 +151,7 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
 
     The verdicts on each row follow.
     """
-    lines = [*table(_parameter_cells(result)), "", *table(_score_cells(result.comparison))]
+    lines = [*table(_parameter_cells(result)), "", *_score_table(result.comparison)]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
     parts = [
@@ -184,11 +187,10 @@ def split_text(result: SplitResult) -> str:
 
 def parameter_table(name: str, rows: Sequence[ParameterResult]) -> list[str]:
     """Return parameters with standard errors and intervals; the head begins with `name`."""
-    width = _width(rows)
-    return [
-        f"{name:<{width}}  {'value':>14}  {'std':>11}  {'95 % interval':^29}  unit",
-        *(f"{_value_cells(row, row.ci95, width)}  {row.unit}".rstrip() for row in rows),
-    ]
+    cells = estimate_rows((row.value, row.std, row.ci95) for row in rows)
+    head = [name, "value", "std", INTERVAL_HEAD, "unit"]
+    body = [[row.name, *own, row.unit] for row, own in zip(rows, cells, strict=True)]
+    return table([head, *body])
 
 
 def design_text(result: DesignResult) -> str:
@@ -204,14 +206,18 @@ def design_text(result: DesignResult) -> str:
         f"predicted   relative error of θ {_or_infinite(result.relative_error)}, "
         f"condition {_or_infinite(result.condition, 3)}",
         "",
-        f"{'parameter':<12}  {'bias':>12}  {'std':>12}",
-        *(
-            f"{name:<12}  {_or_infinite(bias):>12}  {_or_infinite(result.std[name]):>12}"
-            for name, bias in result.bias.items()
+        *table(
+            [
+                ["parameter", "bias", "std"],
+                *(
+                    [name, _or_infinite(bias), _or_infinite(result.std[name])]
+                    for name, bias in result.bias.items()
+                ),
+            ]
         ),
         "",
         "what was tried, relative errors of θ:",
-        *table(rows),
+        *table(rows, drop=["condition"]),
     ]
     return "\n".join(fold(lines))
 
@@ -220,7 +226,7 @@ def _or_infinite(value: float | None, digits: int = 4) -> str:
     return "inf" if value is None else f"{value:.{digits}g}"
 
 
-def warning_lines(warnings: Iterable[WarningResult]) -> list[str]:
+def warning_lines(warnings: Iterable[Warning]) -> list[str]:
     """Return a line for each warning."""
     return [f"warning: {warning.text}" for warning in warnings]
 
@@ -243,13 +249,13 @@ def _suspect_lines(suspects: Sequence[SuspectResult]) -> list[str]:
             for share in suspect.percent.values()
         )
         rows.append([suspect.name, size, *biases, cosine, suspect.removed_by or "–"])
-    return table(rows)
+    return table(rows, drop=["cosine", "size"])
 
 
-def _bias_lines(result: FitResult) -> list[str]:
+def _bias_lines(result: Findings) -> list[str]:
     """Return the bias of every parameter by the learned part, and the interval that covers it."""
     rows = [*result.parameters, *(result.physical_parameters or ())]
-    lines, width, causes = [], _width([row for row in rows if row.bias]), biased_by(rows)
+    lines, causes = [], biased_by(rows)
     what = ("learner found" if result.learns else "free run leaves") + (
         " in one equation" if len(causes) > 1 else ""
     )
@@ -261,22 +267,30 @@ def _bias_lines(result: FitResult) -> list[str]:
             )
         else:
             lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias:")
-        head = (
-            f"{'parameter':<{width}}  {'bias':>11}  {'of std':>7}  {'of value':>9}  "
-            f"{'95 % interval with it':^29}"
-        )
-        lines += [head, *(_bias_line(row, width) for row in own if row.value is not None)]
+        lines += _bias_table([row for row in own if row.value is not None])
     return lines
 
 
-def _bias_line(row: ParameterResult, width: int) -> str:
-    value, bias, reach = row.value or 0.0, row.bias.value if row.bias else None, row.ci95_with_bias
-    bias = _round_share((bias or 0.0) / (value or 1.0)) * (value or 1.0)
-    errors = f"{plain_number(abs(bias) / row.std) if row.std else '–':>7}"
-    part = f"{percent(_round_share(bias / value), sign='+') if value else '–':>9}"
-    none = "–" if row.bias is None or row.bias.determined else "not determined by these data"
-    limits = f"[{_limit(reach[0])}, {_limit(reach[1])}]" if reach else f"{none:^29}"
-    return f"{row.name:<{width}}  {bias:+11.3g}  {errors}  {part}  {limits}".rstrip()
+def _bias_table(rows: Sequence[ParameterResult]) -> list[str]:
+    """Return the biases, in standard errors and per cent, with the intervals that cover them."""
+    reach = estimate_rows((row.value, None, row.ci95_with_bias) for row in rows)
+    cells = [["parameter", "bias", "of std", "of value", "95 % interval with it"]]
+    for row, (_, _, limits) in zip(rows, reach, strict=True):
+        value, bias = row.value or 0.0, row.bias.value if row.bias else None
+        bias = _round_share((bias or 0.0) / (value or 1.0)) * (value or 1.0)
+        errors = plain_number(abs(bias) / row.std) if row.std else "–"
+        part = percent(_round_share(bias / value), sign="+") if value else "–"
+        known = row.bias is None or row.bias.determined
+        cells.append(
+            [
+                row.name,
+                f"{bias + 0.0:+.3g}",
+                errors,
+                part,
+                limits if row.ci95_with_bias or known else "not determined by these data",
+            ]
+        )
+    return table(cells)
 
 
 def _round_share(share: float) -> float:
@@ -284,39 +298,26 @@ def _round_share(share: float) -> float:
     return 0.0 if abs(share) < 1e-9 else share
 
 
-def _physical_lines(result: FitResult) -> list[str]:
+def _physical_lines(result: Findings) -> list[str]:
     rows = result.physical_parameters or []
-    width = _width(rows)
-    between = "95 %, noise only" if result.noise_only else "95 % interval"
-    lines = [
-        f"{'physical':<{width}}  {'value':>14}  {'std':>11}  {between:^29}  {'initial':>11}  unit"
-    ]
-    for row in rows:
-        cells = _value_cells(row, row.profile95 or row.ci95, width)
-        lines.append(f"{cells}  {row.initial:11.5g}  {row.unit}".rstrip())
+    cells = estimate_rows((row.value, row.std, row.profile95 or row.ci95) for row in rows)
+    between = NOISE_ONLY if result.noise_only else INTERVAL_HEAD
+    lines = table(
+        [
+            ["physical", "value", "std", between, "initial", "unit"],
+            *(
+                [row.name, *own, f"{row.initial:.5g}", row.unit]
+                for row, own in zip(rows, cells, strict=True)
+            ),
+        ],
+        drop=["initial"],
+    )
     if result.physical_consistency:
         lines.append(result.physical_consistency.text)
     return lines
 
 
-def _width(rows: Sequence[ParameterResult]) -> int:
-    return max([9, *(len(row.name) for row in rows)])
-
-
-def _value_cells(row: ParameterResult, interval: Sequence[float | None] | None, width: int) -> str:
-    """Return name, value, standard error and interval."""
-    spread = f"{row.std:11.4g}" if row.std is not None else f"{'–':>11}"
-    reach = (
-        f"[{_limit(interval[0])}, {_limit(interval[1])}]" if interval is not None else f"{'–':^29}"
-    )
-    return f"{row.name:<{width}}  {row.value:14.8g}  {spread}  {reach}"
-
-
-def _limit(value: float | None) -> str:
-    return f"{'–':>13}" if value is None else f"{value:13.7g}"
-
-
-def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]:
+def _score_lines(fit: Estimate, result: Findings) -> list[str]:
     """Return the scores as a table, one line per part, kind and output."""
     rows = [["part", "horizon", "output", "RMSE", "NRMSE", "FIT %"]]
     for part, scores in result.scores.items():
@@ -330,10 +331,10 @@ def _score_lines(fit: Estimate | MotionEstimate, result: FitResult) -> list[str]
                 rows.append(
                     [part, kind, channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent]
                 )
-    return [*table(rows), *_residual_lines(result)] if len(rows) > 1 else []
+    return [*table(rows, drop=["NRMSE"]), *_residual_lines(result)] if len(rows) > 1 else []
 
 
-def _residual_lines(result: FitResult) -> list[str]:
+def _residual_lines(result: Findings) -> list[str]:
     """Return the correlations of the one-step residual, where all rows were looked at."""
     lines = []
     for part, scores in result.scores.items():
@@ -394,23 +395,23 @@ def _parameter_cells(result: CompareResult) -> list[list[str]]:
     return rows
 
 
-def _score_cells(rows: Sequence[RowResult]) -> list[list[str]]:
+def _score_table(rows: Sequence[RowResult]) -> list[str]:
     cells = [["structure", "part", "one-step NRMSE", "free-run NRMSE", "free-run FIT %"]]
     for row in rows:
         for part, scores in row.scores.items():
             shown = (scores.prediction.nrmse, scores.simulation.nrmse, scores.simulation.fit)
             cells.append([row.name, part, *(_numbers(values) for values in shown)])
-    return cells
+    return table(cells, drop=["free-run FIT %"])
 
 
 def _estimate(parameter: ParameterResult) -> str:
     if parameter.value is None:
         return "–"
-    spread = f" ± {parameter.std:.2g}" if parameter.std is not None else ""
+    value, std, _, _ = estimate_cells(parameter.value, parameter.std)
+    spread = f" ± {std}" if parameter.std is not None else ""
     bias = parameter.bias.value if parameter.bias and parameter.std is not None else None
     large = bias is not None and parameter.std is not None and abs(bias) > parameter.std
-    digits = digits_for(parameter.value, parameter.std, 6)
-    return f"{parameter.value:.{digits}g}{spread}{f' (bias {bias:+.2g})' if large else ''}"
+    return f"{value}{spread}{f' (bias {bias:+.2g})' if large else ''}"
 
 
 def _numbers(values: Sequence[float | None] | None) -> str:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
+from orthaug._base.content import Flag, Number, Whole
+from orthaug._base.errors import Warning
 from orthaug._base.lines import fold
-from orthaug.reports.fields import Content, Flag, Number, WarningResult, Whole
-from orthaug.reports.result import FileResult, ParameterResult, ResultHeader
+from orthaug.analysis.fit_findings import ParameterResult
+from orthaug.fitting.recursive import Alarm
+from orthaug.reports.result import FileResult, ResultHeader
 from orthaug.reports.text import parameter_table, warning_lines
-
-
-class AlarmResult(Content):
-    """An alarm: the residual left its band."""
-
-    row: Whole
-    time: Number
 
 
 class TrackResult(ResultHeader):
@@ -28,10 +24,10 @@ class TrackResult(ResultHeader):
     effective_rows: Number
     parameters: list[ParameterResult]
     physical_parameters: list[ParameterResult] | None
-    alarms: list[AlarmResult]
+    alarms: list[Alarm]
     alarmed: Flag
     alarm_level: Number
-    warnings: list[WarningResult]
+    warnings: list[Warning]
 
 
 def track_text(result: TrackResult) -> str:

@@ -16,6 +16,7 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimation import estimate
+from orthaug.inference.chosen_terms import NONE, SPLIT, Intervals
 from orthaug.models.learners import MLP, Learner
 from orthaug.models.terms import Terms
 from orthaug.physics.baseline import Baseline
@@ -23,11 +24,6 @@ from orthaug.selection.false_discoveries import LEVEL, false_discovery_rates
 from orthaug.selection.kept_physics import PhysicsComparison
 from orthaug.selection.nonlinearity import Nonlinearity
 from orthaug.selection.orders import Delay, Orders, OrderSearch
-from orthaug.selection.parts import (
-    NONE,
-    SPLIT,
-    Intervals,
-)
 from orthaug.selection.rivals import rivals
 from orthaug.selection.term_path import (
     RankedModel,
@@ -40,7 +36,7 @@ from orthaug.selection.term_runs import TermRuns
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthaug.fitting.estimates import Estimate
+    from orthaug.fitting.lagged_estimate import LaggedEstimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +176,7 @@ class Selection:
         )
         return rivals(own, from_both_starts(own, self.terms.chosen.point.chosen))
 
-    def estimate(self, **options: Any) -> Estimate:
+    def estimate(self, **options: Any) -> LaggedEstimate:
         """Return the fit of the choice to `record`; `options` of `estimate` beside it.
 
         It has no standard errors and no intervals where the rows that are fitted chose the terms.

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -150,7 +151,8 @@ def added_to_motion(
     """
     if motion.functions is not None:
         return None
-    start = dict(zip(motion.names, values, strict=True))
+    loop, motion = motion, motion.plant
+    start = dict(zip(loop.names, values, strict=True))
     texts = {state.name: str(state.derivative) for state in motion.states}
     texts |= {output.name: str(output.expression) for output in motion.outputs}
     new: list[PhysicalParameter] = []
@@ -197,7 +199,7 @@ def added_to_motion(
         else (f"motion.outputs.{name}", "expression", texts[name])
         for name in places
     )
-    return ChangedMotion(changed, tuple(new), equations)
+    return ChangedMotion(loop.around(changed), tuple(new), equations)
 
 
 def _unit_inside(inner: str, added: NewTerm, units: dict[str, str]) -> str:
@@ -420,7 +422,7 @@ def _declared_expressions(
             "suspects",
             "a list of Suspects, or of MotionSuspects of a motion",
         )
-        where = suspect.equation if isinstance(suspect, MotionSuspect) else suspect.output
+        where = suspect.equation or suspect.output
         if where is not None and where not in names:
             raise InputError(
                 f"suspect '{suspect.name}': the learner adds nothing to '{where}', but to "
@@ -500,12 +502,7 @@ def _why_nothing(
 def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[ExplainingTerm, ...]:
     linearization, before, found = space.linearization, 0.0, []
     taken = [*linearization.units, *(p.name for p in linearization.parameters)]
-    if isinstance(linearization.physics, Motion):
-        taken += list(linearization.physics.known)
-    else:
-        taken += [name for name, _ in linearization.physics.constants] + [
-            term.parameter for term in linearization.physics.terms
-        ]
+    taken += linearization.physics.names_taken
     names = names_for([_base_name(one) for one in chosen], taken)
     columns = [space.column(one) for one in chosen]
     std = (
@@ -548,12 +545,32 @@ def _physics(
     linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Any
 ) -> tuple[Baseline | Motion | None, str | None]:
     """Return the physics with the terms added, and the lines that say so in a spec."""
-    several = len(linearization.places) > 1
     added = [_new_term(linearization, term) for term in terms]
-    if isinstance(linearization.physics, Motion):
-        changed = added_to_motion(linearization.physics, moved, added, linearization.units)
-        return (None, None) if changed is None else (changed.motion, changed.lines())
-    baseline = added_to_baseline(linearization.physics, moved, added, several)
+    return _with_terms(linearization.physics, linearization, moved, added)
+
+
+@singledispatch
+def _with_terms(
+    physics: Any, linearization: LearnedLinearization, moved: Any, added: Sequence[NewTerm]
+) -> tuple[Baseline | Motion | None, str | None]:
+    """Return physics of a kind with terms, and the lines of a spec."""
+    raise NotImplementedError
+
+
+@_with_terms.register(Motion)
+def _motion_with_terms(
+    physics: Motion, linearization: LearnedLinearization, moved: Any, added: Sequence[NewTerm]
+) -> tuple[Motion | None, str | None]:
+    changed = added_to_motion(physics, moved, added, linearization.units)
+    return (None, None) if changed is None else (changed.motion, changed.lines())
+
+
+@_with_terms.register(Baseline)
+def _baseline_with_terms(
+    physics: Baseline, linearization: LearnedLinearization, moved: Any, added: Sequence[NewTerm]
+) -> tuple[Baseline | None, str | None]:
+    several = len(linearization.places) > 1
+    baseline = added_to_baseline(physics, moved, added, several)
     return (None, None) if baseline is None else (baseline, baseline_lines(added, several))
 
 

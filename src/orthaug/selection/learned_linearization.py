@@ -20,7 +20,7 @@ from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
-from orthaug.inference.motion_split import slopes_at
+from orthaug.inference.splitting import slopes_at
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
@@ -346,7 +346,8 @@ class _Run(NamedTuple):
             left -= whole
             rows = model.form.inputs(experiment, record)[:whole]
             starts = np.arange(whole) % (length or max(whole, 1)) == 0
-            pieces.append((x[:whole], experiment.inputs[:whole], rows, starts))
+            read = model.form.at_samples(model.numbers, x[:whole], rows)
+            pieces.append((x[:whole], read, rows, starts))
         return cls(*(np.concatenate(part) for part in zip(*pieces, strict=True)))
 
 

@@ -20,12 +20,13 @@ from orthaug.fitting.criteria import Criterion, Simulation
 from orthaug.fitting.estimation import estimate
 from orthaug.fitting.held_out import held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.inference.chosen_terms import NONE, Intervals
 from orthaug.models.learners import MLP, Learner
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import runs_on
 from orthaug.models.terms import Terms
-from orthaug.physics.baseline import Baseline
-from orthaug.physics.problem import Problem, pose, regressor_of
+from orthaug.physics.baseline import Baseline, regressor_of
+from orthaug.physics.problem import Problem, pose
 from orthaug.selection.candidates import candidates
 from orthaug.selection.choice import LearnerSearch, Selection
 from orthaug.selection.false_discoveries import LEVEL, Control
@@ -33,15 +34,7 @@ from orthaug.selection.forward import COLLINEAR
 from orthaug.selection.kept_physics import PhysicsComparison, kept_physics
 from orthaug.selection.nonlinearity import Nonlinearity, nonlinearity
 from orthaug.selection.orders import Delay, Orders, OrderSearch, search_orders
-from orthaug.selection.parts import (
-    AS_DECLARED,
-    CONDITIONAL,
-    NONE,
-    Intervals,
-    Parts,
-    of_parts,
-    split_record,
-)
+from orthaug.selection.parts import AS_DECLARED, CONDITIONAL, Parts, of_parts, split_record
 from orthaug.selection.term_path import (
     OnModel,
     PathModel,
@@ -163,10 +156,6 @@ there is.
 """
 
 
-def _unheard(stage: str, rung: Any) -> None:
-    """Ignore a model; used where nobody listens."""
-
-
 def select(
     record: Record,
     baseline: Baseline | None = None,
@@ -179,7 +168,7 @@ def select(
     blocks: int = 5,
     halves: bool | Parts | None = None,
     fitted: Record | None = None,
-    progress: OnStage = _unheard,
+    progress: OnStage | None = None,
     engine: Engine | None = None,
     collinear: float = COLLINEAR,
     level: float = LEVEL,
@@ -409,13 +398,14 @@ def _add_notes(found: Selection, declared: Record) -> Selection:
 class _Listener:
     """Hands on what was judged, and remembers whether it was asked to stop."""
 
-    def __init__(self, progress: OnStage) -> None:
+    def __init__(self, progress: OnStage | None) -> None:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:
         def report(rung: Any) -> None:
             try:
-                self.progress(stage, rung)
+                if self.progress is not None:
+                    self.progress(stage, rung)
             except KeyboardInterrupt:
                 self.stopped = True
                 raise

@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from orthaug.data.record import Record
-from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.solvers.adam_lbfgs import AdamLBFGS
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Additive, Orthogonal, Structure
@@ -155,7 +155,7 @@ def train(
     seed: int = 0,
     iterations: int = 300,
     regularization: str = "none",
-) -> Estimate:
+) -> LaggedEstimate:
     """Return one fit of an example by a pipeline; `which` names the paper's iterations.
 
     Args:

@@ -31,7 +31,7 @@ from orthaug.studies.synthetic import NOISE_30_DB, static
 if TYPE_CHECKING:
     import pandas as pd
 
-    from orthaug.fitting.estimates import Estimate
+    from orthaug.fitting.lagged_estimate import LaggedEstimate
 
 RIDGE = 1e-4
 KINDS = {
@@ -48,7 +48,7 @@ _MARKERS = {"training": "o", "paper": "s", "uniform": "^"}
 
 
 @lru_cache
-def _noiseless(data_set: int) -> Estimate:
+def _noiseless(data_set: int) -> LaggedEstimate:
     example = static(data_set)
     return estimate(
         example.train,

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Vector
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.fitting.conclusion import conclude
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.normal_equations import Hold, OneStep, linearise
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.solvers.compiled import TrainingRun, effective_weights
@@ -124,7 +124,7 @@ def _adam(start: Any, data: Data, bound: Bound, projects: bool, iterations: int)
 
 def train(
     example: Example, structure: Structure, iterations: tuple[int, int], seed: int
-) -> Estimate:
+) -> LaggedEstimate:
     """Return one run of the published scripts on one of their examples.
 
     Args:

@@ -95,6 +95,12 @@ class ModelView:
             if "motion" in content:
                 self._draw_motion(content)
                 return
+            source = _source_of(content)
+            if source:
+                where = f"{source.get('kind', 'source')} {source.get('file', '')}".strip()
+                words = f"Physics from a file ({where}), written in the spec below."
+                text(words, "p", "hint")
+                return
             outputs = spec_text.names(spec_text.section(content, "data"), "outputs")
             text(
                 " and ".join(f"{name}[k] = Σ parameter · regressor" for name in outputs),
@@ -170,7 +176,7 @@ class ModelView:
             spec_text.section(content, "learner"),
             spec_text.section(content, "training"),
         )
-        moves = "motion" in content
+        moves = "motion" in content or bool(_source_of(content))
         with redrawn(self.learner):
             if not content:
                 text("A learner finds what the physics lacks.", "p", "hint")
@@ -304,6 +310,11 @@ def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> 
         table(("missing term", "change of each parameter", "removed by"), rows)
     for warning in checked["warnings"]:
         note(warning["text"], "care")
+
+
+def _source_of(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the section [physics.source] of a spec; empty where there is none."""
+    return spec_text.section(content, "physics", "source")
 
 
 def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None:

@@ -208,9 +208,9 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
 
     text = Path(path).read_text(encoding="utf-8")
     if kind == "fit":
-        found = fit_verdict(FitResult.model_validate_json(text))
+        found = fit_verdict(FitResult.from_json(text))
     else:
-        found = compare_verdict(CompareResult.model_validate_json(text))
+        found = compare_verdict(CompareResult.from_json(text))
     return {"level": found.level, "sentences": found.sentences}
 
 
@@ -234,9 +234,7 @@ def _prepared_curves(job: Job) -> dict[str, Any]:
         for e in record.experiments:
             values = np.hstack([e.inputs, e.outputs])[:, j]
             share = max(8, MOST * len(e) // max(len(record), 1))
-            curve = thin_curve(
-                e.start_time + record.sampling_time * np.arange(len(e)), values, share
-            )
+            curve = thin_curve(e.instants(record.sampling_time), values, share)
             x, y = [*x, *curve["x"], None], [*y, *curve["y"], None]
         curves[channel.name] = {
             "x": x[:-1],

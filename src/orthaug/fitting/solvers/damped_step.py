@@ -40,7 +40,7 @@ class Damping(NamedTuple):
         return 1.0 if self.diagonal else xp.max(xp.diag(hessian), initial=1e-300)
 
 
-# Docs/design.md has the comparison of first dampings
+# docs/decisions/damping.md has the comparison of first dampings
 IDENTITY = Damping(1e-5, 1e12, diagonal=False)
 MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 

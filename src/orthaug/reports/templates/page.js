@@ -1,6 +1,7 @@
 "use strict";
 (async () => {
   const COLUMNS = 1400; // of pixels for which the least and the largest value of a curve are drawn
+  const DENSE = 2; // samples in a column from which on a curve is drawn as an area
   const PAPER = 0.76; // height of a plot on paper over that on a screen
   const FONT = { family: "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif", size: 12 };
   const CONFIG = {
@@ -79,11 +80,25 @@
     return value;
   }
 
+  /* Where many samples share a pixel a curve is the area between its least and largest values: the measured one
+     filled, that of the model as its outline, so that both are seen. */
+  function envelope(series, range, kind, line) {
+    const low = outline(series, range[0], range[1], "min", 0), high = outline(series, range[0], range[1], "max", 0);
+    const filled = kind === "area" ? { fill: "toself", fillcolor: line.color } : { fill: "none" };
+    return {
+      x: [...low.x, ...high.x.reverse(), low.x[0]], y: [...low.y, ...high.y.reverse(), low.y[0]], ...filled,
+      line: { ...line, width: kind === "area" ? 0 : 1 },
+    };
+  }
+
   function traces(figure, range) {
     return figure.data.map((trace) => {
       const series = curve(figure, trace);
-      const { series: _, minus, edge, plus, ...own } = trace;
-      return series ? { type: "scatter", mode: "lines", ...own, ...outline(series, range[0], range[1], edge, plus) } : own;
+      const { series: _, minus, edge, plus, envelope: kind, ...own } = trace;
+      if (!series) return own;
+      const drawn = { type: "scatter", mode: "lines", fill: "none", ...own };
+      const dense = kind && (range[1] - range[0]) / series.dx > DENSE * COLUMNS;
+      return { ...drawn, ...(dense ? envelope(series, range, kind, own.line) : outline(series, range[0], range[1], edge, plus)) };
     });
   }
 
@@ -136,7 +151,9 @@
 
   /* On paper plots are lower, so that few pages end where the next plot does not fit. */
   const heightOf = (figure, width) => Math.round((onPaper ? PAPER : 1) * figure.height) + taller(figure, width);
-  const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : Math.max(place.clientWidth, least(place)));
+  const widthOf = (place) => (onPaper ? (figures[place.dataset.figure].small ? 320 : 660) : Math.max(place.clientWidth || hidden(place), least(place)));
+  /* Of a folded section: it is drawn anew when it is opened. */
+  const hidden = (place) => (figures[place.dataset.figure].small ? 320 : document.querySelector("main").clientWidth);
   /* Cells that hold numbers keep their width; what does not fit a narrow screen is scrolled. */
   const least = (place) => Math.max(0, ...figures[place.dataset.figure].data.map((t) => (t.texttemplate ? 130 + 28 * t.x.length : 0)));
   const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
@@ -159,7 +176,13 @@
     if (!flown(figure)) return;
     const range = place.layout.xaxis.range.map(Number);
     const fresh = traces(figure, range), which = figure.data.map((t, i) => (t.series || t.minus ? i : -1)).filter((i) => i >= 0);
-    Plotly.restyle(place, { x: which.map((i) => fresh[i].x), y: which.map((i) => fresh[i].y) }, which);
+    const drawn = coloured(fresh, style()), each = (of) => which.map((i) => of(drawn[i]));
+    Plotly.restyle(place, {
+      x: each((t) => t.x), y: each((t) => t.y), fill: each((t) => t.fill ?? "none"),
+      fillcolor: each((t) => t.fillcolor ?? null), "line.width": each((t) => t.line?.width ?? 1.3),
+    }, which);
+    const button = place.parentElement.querySelector(".whole-record");
+    if (button) button.setAttribute("aria-pressed", String(range[0] <= figure.whole[0] && range[1] >= figure.whole[1]));
   }
 
   function keys(place, event) {
@@ -168,7 +191,7 @@
     const [low, high] = place.layout.xaxis.range.map(Number), width = high - low;
     const moves = {
       ArrowLeft: [low - width / 4, high - width / 4], ArrowRight: [low + width / 4, high + width / 4],
-      "+": [low + width / 4, high - width / 4], "-": [low - width / 2, high + width / 2], 0: home(figure),
+      "+": [low + width / 4, high - width / 4], "-": [low - width / 2, high + width / 2], 0: figure.whole ?? home(figure),
     };
     const range = moves[event.key === "=" ? "+" : event.key];
     if (!range) return;
@@ -185,7 +208,23 @@
         if (Object.keys(changed).some((key) => key.startsWith("xaxis"))) refine(place);
       });
       place.addEventListener("keydown", (event) => keys(place, event));
+      const button = place.parentElement.querySelector(".whole-record");
+      button?.addEventListener("click", () => {
+        const figure = figures[place.dataset.figure], whole = button.getAttribute("aria-pressed") === "false";
+        Plotly.relayout(place, { "xaxis.range": [...(whole ? figure.whole : home(figure))] });
+      });
     }
+    document.querySelectorAll(".folded").forEach((section) => section.addEventListener("toggle", () => {
+      if (section.open && !onPaper) section.querySelectorAll("[data-figure]").forEach(draw);
+    }));
+    const unfold = () => {
+      const target = location.hash.length > 1 && document.getElementById(location.hash.slice(1));
+      const folded = target && target.querySelector(":scope > .folded");
+      if (folded) { folded.open = true; target.scrollIntoView(); }
+    };
+    addEventListener("hashchange", unfold);
+    document.querySelectorAll("nav a").forEach((link) => link.addEventListener("click", () => setTimeout(unfold)));
+    unfold();
     dark.addEventListener("change", redraw);
     let waiting, width = innerWidth;
     addEventListener("resize", () => {

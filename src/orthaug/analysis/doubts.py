@@ -1,0 +1,215 @@
+"""Causes of error that the intervals of a fit do not count: missing structure or a missing state.
+
+Every fit is tested, for either kind of physics, with a learner or without one.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
+from orthaug._base.lines import percent
+from orthaug.analysis.attempt import attempt
+from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResult
+from orthaug.analysis.fit_findings import Findings, ParameterResult
+
+if TYPE_CHECKING:
+    from orthaug.analysis.hidden_state import FamilyTest, StructureTest
+
+E = TypeVar("E", bound=Any)
+"""An `Examination`."""
+
+_LISTED = 3  # parameters, and terms with memory
+_DETERMINED = re.compile(
+    r"( The data determine | Of the physical parameters they determine )[^.]*\."
+    r"|: the data determine [^.]*"
+)
+
+
+def doubt(made: E) -> E:
+    """Return an examination with the warnings `unexplained` and `hidden_state`.
+
+    Its intervals are marked with what they count.
+    """
+    from orthaug.analysis.hidden_state import structure_test  # slow to import
+
+    fit, result = made.fit, made.result
+    if not fit.status.ok:
+        return made
+    failed: list[Any] = []
+    test = attempt(
+        "the search for a hidden state",
+        lambda: structure_test(fit.model, fit.problem.record),
+        failed,
+        None,
+    )
+    unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
+    known = {warning.code for warning in result.warnings}
+    warnings: list[Warning] = list(failed)
+    if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
+        warnings.append(
+            Warning(code="unexplained", text=_unexplained_text(test, bool(result.residuals)))
+        )
+    if test is not None and test.has_memory:
+        warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
+    found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
+    if test is not None and test.found:
+        found["unexplained"] = _structure(fit, test)
+    if any(warning.code == "unexplained" for warning in found["warnings"]):
+        found |= {
+            name: _noise_only(getattr(result, name))
+            for name in ("parameters", "physical_parameters")
+        }
+    reason = _reason(result, test, unmodelled)
+    if result.shared is not None and reason:
+        found["shared"] = _withdraw(result.shared, reason)
+    return replace(made, result=result.changed(**found))
+
+
+def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | None:
+    """Return the parameters with their intervals marked as those of noise alone."""
+    if rows is None:
+        return None
+    return [
+        row.model_copy(update={"ci95_counts": "noise only"}) if row.ci95 is not None else row
+        for row in rows
+    ]
+
+
+def _unexplained_text(test: StructureTest | None, judged: bool) -> str:
+    if test is None or not test.found:
+        what = "the residual contains more than noise"
+        what += " (its verdict is `unmodelled`)" if judged else ""
+    else:
+        best = max(
+            (one for one in (test.static, test.memory) if one is not None),
+            key=lambda one: one.share,
+        )
+        name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
+        what = (
+            f"the model's error contains more than noise: {name} in {best.equation} predicts "
+            f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
+            "own past predicts"
+        )
+    return (
+        f"{what}. The 95 % intervals count noise only; missing physics may have moved the "
+        "parameters by more. Search for its terms with `[[suspects]]` or `orthaug explain`. "
+        "Write them into the physics, or let the learner see what they depend on."
+    )
+
+
+def _hidden_state(fit: Any, test: StructureTest) -> str:
+    assert test.memory is not None
+    best = test.memory
+    others = [
+        one.name
+        for one in test.families
+        if one.sure and one is not best and one.share > 0.8 * best.share
+    ]
+    beside = f" ({', '.join(others[: _LISTED - 1])} nearly as much)" if others else ""
+    remedy = (
+        f"{fit.problem.new_state}; or let the learner see lags or a filtered copy of that signal"
+    )
+    return (
+        f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
+        f"the free run's error on held-out rows{beside}. No function of the model's own states "
+        f"predicts it.{_movement_text(fit, best)} Remedy: {remedy}."
+    )
+
+
+def _movement_text(fit: Any, best: FamilyTest) -> str:
+    """Return a sentence on how much a term moves the parameters."""
+    values = _values_with(fit, best)
+    if not values:
+        return ""
+    now = _current_values(fit)
+    moves = sorted(
+        values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300)
+    )
+    listed = ", ".join(
+        f"{name} {values[name]:.4g} instead of {now[name]:.4g}" for name in moves[:_LISTED]
+    )
+    return f" With it the fit gives {listed}."
+
+
+def _current_values(fit: Any) -> dict[str, float]:
+    return dict(zip(fit.problem.names, map(float, fit.values), strict=True))
+
+
+def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
+    """Return the parameters of a fit with an additional term."""
+    names = list(_current_values(fit))
+    moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
+    if len(best.moves) != len(names):
+        return {}
+    values = fit.problem.values_at(moved)
+    return {
+        name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
+    }
+
+
+def _structure(fit: Any, test: StructureTest) -> StructureResult:
+    sure = [one for one in test.families if one.sure]
+    return StructureResult(
+        hidden_state=test.has_memory,
+        static=None if test.static is None else memory_result(test.static),
+        memory=[memory_result(one, _values_with(fit, one)) for one in sure],
+    )
+
+
+def memory_result(one: FamilyTest, parameters: dict[str, float] | None = None) -> MemoryResult:
+    """Return a family of terms as results list it."""
+    scale = None if one.term is None else one.term.scale
+    own = {
+        "name": one.name,
+        "kind": one.kind,
+        "on": one.on,
+        "scale": scale,
+        "equation": one.equation,
+    }
+    return MemoryResult.model_validate(
+        {**own, "share": one.share, "p": one.p, "parameters": parameters or None}
+    )
+
+
+def _reason(result: Findings, test: StructureTest | None, unmodelled: bool) -> str:
+    """Return the reason why the fit determines no parameter; empty where it determines some."""
+    if test is not None and test.found:
+        best = max(
+            (one for one in (test.static, test.memory) if one is not None),
+            key=lambda one: one.share,
+        )
+        return (
+            f"what the model leaves is no function of what the learner sees ({best.name} "
+            "predicts it)"
+        )
+    if unmodelled:
+        return "the residual contains more than noise"
+    stopped = {"not_converged", "stopped"} & {warning.code for warning in result.warnings}
+    if result.status.code == "iteration_limit" or stopped:
+        return "training had not converged"
+    return ""
+
+
+def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
+    """Return what the learner could imitate, with no parameter determined by the fit."""
+    lost = [*shared.determined, *(shared.physical or [])]
+    if not lost:
+        return shared
+    text = _DETERMINED.sub("", shared.text).rstrip(".")
+    named = ", ".join(lost)
+    text = f"{text}. The data would determine {named} with such a learner, but not here: {reason}."
+    physical = None if shared.physical is None else []
+    update = {
+        "text": text,
+        "determined": [],
+        "physical": physical,
+        "withdrawn": lost,
+        "doubt": reason,
+    }
+    return shared.model_copy(update=update)

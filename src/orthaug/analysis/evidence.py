@@ -1,0 +1,190 @@
+"""What a fit is judged by, beside itself: the parts of the data and what was declared about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Self
+
+from orthaug._base.checks import check_count, check_type
+from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.suspects import (
+    MotionSuspect,
+    Suspect,
+    check_motion_suspects,
+    suspect_columns,
+)
+from orthaug.analysis.wild_effect import fit_without
+from orthaug.data.part import Part
+from orthaug.data.preparation import warnings_of
+from orthaug.data.record import Record
+from orthaug.data.wild import data_warnings
+from orthaug.fitting.criteria import Criterion
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.kinds import STRUCTURES
+from orthaug.fitting.noise import Noise, noise_of_motion
+from orthaug.fitting.structures import Structure
+from orthaug.inference.measures import Measure, Training
+from orthaug.models.learners import Learner, declared
+from orthaug.models.rows import InMemory
+from orthaug.models.tasks import runs_on
+from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.problem import Problem
+
+DEFAULT_BLOCKS = 4
+"""Blocks of cross-validation where no part is held out."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """The data and declarations by which a fit is judged."""
+
+    parts: tuple[Part, ...]
+    """Training data first; the parts of tests have names that begin with "tests."."""
+    problem: Any
+    """The problem as it was posed, whatever the fit made of it."""
+    learner: Learner | None
+    """The learner that was asked for, also where the fit left it out."""
+    structure: Structure
+    criterion: Criterion
+    measure: Measure = Training()  # noqa: RUF009  (frozen)
+    noise: Noise = "white"
+    """The noise model that was asked for."""
+    suspects: tuple[Any, ...] = ()
+    map: PhysicsMap | None = None
+    """From physical parameters to θ."""
+    profiles: bool = False
+    """Whether physical parameters get profile intervals, too."""
+    blocks: int | None = None
+    """Blocks of cross-validation; None for none beside held-out parts, else `DEFAULT_BLOCKS`."""
+    runner: Any = InMemory()  # noqa: RUF009  (frozen)
+    """Makes the fits of cross-validation."""
+    warnings: tuple[Warning, ...] = ()
+    """Warnings on the data and on what was left out before training."""
+
+    @classmethod
+    def of(
+        cls,
+        fit: Estimate,
+        *,
+        validation: Record | None = None,
+        tests: Record | Mapping[str, Record] | None = None,
+        suspects: Sequence[Suspect] | Sequence[MotionSuspect] = (),
+        physics: PhysicsMap | None = None,
+        profiles: bool = False,
+        blocks: int | None = None,
+        skip: int = 0,
+    ) -> Self:
+        """Return what a fit in memory can be judged by; arguments as of `Estimate.diagnose`.
+
+        Raises:
+            InputError: records or suspects that do not fit the model.
+        """
+        check_type(physics, PhysicsMap | None, "physics", "a PhysicsMap, or None")
+        blocks = None if blocks is None else check_count(blocks, "blocks", least=0)
+        if blocks == 1:
+            raise InputError("`blocks` must be 2 or more, or 0 for none; got 1.")
+        setup, problem = fit.setup, _problem_of(fit)
+        learner = fit.model.form.bound.learner if fit.learns else None
+        structure, own = STRUCTURES[fit.model.structure](), getattr(fit, "measure", None)
+        measure = getattr(own, "measure", None) or (Training() if setup is None else None)
+        if setup is not None:
+            learner, structure = setup.learner, setup.structure
+            validation = setup.options["validation"] if validation is None else validation
+        engine = InMemory() if setup is None else setup.options.get("engine", InMemory())
+        record = fit.problem.record
+        return cls(
+            parts=_parts_of(fit, validation, tests, check_count(skip, "skip", least=0)),
+            problem=problem,
+            learner=learner,
+            structure=structure,
+            criterion=fit.criterion if setup is None else setup.criterion,
+            measure=structure.measure if measure is None else measure,
+            noise="white" if setup is None else setup.noise,
+            suspects=_checked_suspects(suspects, problem),
+            map=physics,
+            profiles=profiles,
+            blocks=blocks,
+            runner=runs_on(engine),
+            warnings=(
+                *warnings_of(record.prepared, [channel.name for channel in record.channels]),
+                *sample_warnings(problem),
+            ),
+        )
+
+    @property
+    def train(self) -> Part:
+        """The training data."""
+        return self.parts[0]
+
+    @property
+    def held_out(self) -> tuple[Part, ...]:
+        """The parts that were not fitted."""
+        return self.parts[1:]
+
+    @property
+    def wanted_blocks(self) -> int:
+        """Number of blocks of cross-validation: by default none beside held-out parts."""
+        return (0 if self.held_out else DEFAULT_BLOCKS) if self.blocks is None else self.blocks
+
+    @property
+    def method(self) -> str:
+        """The method of estimation, as `closed_loop` names it."""
+        if not isinstance(self.problem, Problem):
+            if noise_of_motion(self.noise) == "innovations":
+                return "noise"
+            return "loop" if self.problem.motion.held else "motion"
+        if self.noise != "white":
+            return "noise"
+        return "direct" if self.criterion.free_run is None else "free run"
+
+
+def sample_warnings(problem: Any) -> list[Warning]:
+    """Return warnings on training samples that are no measurements.
+
+    Of physics that is linear in θ they say what a fit without them gives.
+    """
+    lagged = isinstance(problem, Problem)
+    without = partial(fit_without, problem) if lagged else (lambda samples: "")
+    return list(data_warnings(problem.record, without))
+
+
+def _problem_of(fit: Estimate) -> Any:
+    """Return the problem of a fit with its learner, also where physics alone was kept."""
+    setup = fit.setup
+    if setup is None or fit.learns or not isinstance(setup.problem, Problem):
+        return fit.problem if setup is None or fit.learns else setup.problem
+    return independent_terms(setup.problem, declared(setup.learner))[0]
+
+
+def _parts_of(
+    fit: Estimate,
+    validation: Record | None,
+    tests: Record | Mapping[str, Record] | None,
+    skip: int,
+) -> tuple[Part, ...]:
+    check_type(validation, Record | None, "validation", "a Record, or None")
+    named = {"test": tests} if isinstance(tests, Record) else tests or {}
+    if not isinstance(named, Mapping) or not all(isinstance(one, Record) for one in named.values()):
+        raise InputError("`tests` must be records by their names, such as {'steps': record}.")
+    records = {} if validation is None else {"validation": validation}
+    records |= {f"tests.{name}": record for name, record in named.items()}
+    held_out = (
+        Part(name, fit.model.fitting(record, need_outputs=True), skip)
+        for name, record in records.items()
+    )
+    return (Part("train", fit.problem.record), *held_out)
+
+
+def _checked_suspects(suspects: Sequence[Any], problem: Any) -> tuple[Any, ...]:
+    lagged, suspects = isinstance(problem, Problem), tuple(suspects)
+    kind, words = (Suspect, "Suspects") if lagged else (MotionSuspect, "MotionSuspects")
+    for suspect in suspects:
+        check_type(suspect, kind, "suspects", f"a list of {words}")
+    if lagged:
+        suspect_columns(suspects, problem.rows.x, problem.layout, problem.outputs, problem.lengths)
+    else:
+        check_motion_suspects(suspects, problem)
+    return suspects

@@ -1,0 +1,263 @@
+"""The findings that depend on the kind of physics: lagged, which is linear in θ, or a motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from orthaug._base.errors import Warning
+from orthaug.analysis.attempt import attempt, attempt_warned
+from orthaug.analysis.bias import bias_table
+from orthaug.analysis.budget import budget_on
+from orthaug.analysis.diagnosis import diagnose
+from orthaug.analysis.evidence import Evidence
+from orthaug.analysis.fit_findings import MeasureResult, physical_rows
+from orthaug.analysis.free_run_bias import linearize_fit
+from orthaug.analysis.free_run_stability import stability
+from orthaug.analysis.imitation import Imitation, MotionImitation, imitation
+from orthaug.analysis.learned_part import equation_parts
+from orthaug.analysis.measure_bias import LaggedTerms, bias_under
+from orthaug.analysis.missing_lags import missing_lags
+from orthaug.analysis.motion_modes import motion_stability
+from orthaug.analysis.motion_response import substep_bias
+from orthaug.fitting.elimination import directions
+from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.inference.measures import WeighedPhysics, weigh_problem
+from orthaug.inference.nearly_shared import shared_warnings
+from orthaug.models.learners import learns
+from orthaug.models.response import Response
+
+_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: there are too few rows, or it is rounding error only.",
+)
+_RUN_NOT_ANALYSED = Warning(
+    "residual_not_analysed",
+    "the residual is not analysed: the free run diverged, has too few rows, or leaves rounding "
+    "error only.",
+)
+
+
+def describe_physics(fit: Estimate) -> dict[str, Any]:
+    """Return the section of the findings that only this kind of physics has."""
+    noise = {"noise": list(fit.noise)} if fit.status.ok and fit.noise else {}
+    if not isinstance(fit, MotionEstimate):
+        return noise
+    motion, form = fit.problem.motion, fit.model.form
+    return {
+        "motion": {
+            "states": motion.names_of_states,
+            "integrator": motion.integrator,
+            "substeps": form.substeps,
+            "hold": motion.hold,
+            "window": fit.model.window,
+            "parts": (),
+            "substep_bias": None,
+        },
+        **noise,
+    }
+
+
+def analyse_physics(
+    fit: Estimate, evidence: Evidence, one_step: Response, free_run: Response, warnings: list[Any]
+) -> dict[str, Any]:
+    """Return the findings on a fit, with the `budget` of its biases; warnings are added.
+
+    Args:
+        one_step: prediction of the training data, and `free_run` over them.
+    """
+    if isinstance(fit, MotionEstimate):
+        return _of_motion(fit, evidence, one_step, free_run, warnings)
+    assert isinstance(fit, LaggedEstimate)
+    return _of_lagged(fit, evidence, one_step, free_run, warnings)
+
+
+def imitable(fit: Estimate, evidence: Evidence) -> tuple[Imitation | None, list[Warning]]:
+    """Return what the learner of a fit could imitate, and warnings on what it nearly could.
+
+    None without a learner, or where the structure splits nothing along chosen directions.
+    """
+    if isinstance(fit, LaggedEstimate):
+        return imitable_before(fit.problem, evidence, fit)
+    assert isinstance(fit, MotionEstimate)
+    if not fit.status.ok or not fit.learns:
+        return None, []
+    seen = [str(entry) for entry in fit.model.form.features]
+    found, form = MotionImitation.of(seen, fit.shared), fit.model.form
+    if form.motion.memory:
+        record = fit.problem.record
+        first = replace(record, experiments=record.experiments[:1])
+        found = found.with_memory(
+            form, fit.theta, *np.split(fit.reach(first), [form.states], axis=1)
+        )
+    return found, shared_warnings(fit.shared, seen)
+
+
+def imitable_before(
+    problem: Any, evidence: Evidence, fit: LaggedEstimate | None = None
+) -> tuple[Imitation | None, list[Warning]]:
+    """Return what a learner beside lagged physics could imitate, as `imitable`.
+
+    Args:
+        fit: None before training, with the effect of other learner inputs.
+    """
+    structure = evidence.structure
+    if not learns(evidence.learner) or not structure.projects or structure.shared == "all":
+        return None, []
+    if not problem.baseline.names or not problem.features.entries:
+        return None, []
+    held = tuple(fit.at_bound) if fit else ()
+    found = imitation(problem, evidence.map, others=fit is None, held=held)
+    if fit is not None and not (fit.status.ok and fit.learns):
+        return found, []
+    seen = [str(entry) for entry in problem.features.entries]
+    return found, shared_warnings(problem.shared, seen)
+
+
+def bias_before(evidence: Evidence, weighed: WeighedPhysics) -> list[dict[str, Any]]:
+    """Return the bias of lagged physics by every suspect before training, under a measure.
+
+    It includes the usual suspects, since it shows which measure removes a bias.
+    """
+    problem = evidence.problem
+    if not problem.baseline.names:
+        return []
+    along = directions(evidence.structure, problem) if learns(evidence.learner) else None
+    terms = LaggedTerms(weighed, problem, problem.least_squares, evidence.map, None, along)
+    return bias_under(terms, evidence.suspects, certify_usual=True)
+
+
+def _of_lagged(
+    fit: LaggedEstimate,
+    evidence: Evidence,
+    one_step: Response,
+    free_run: Response,
+    warnings: list[Any],
+) -> dict[str, Any]:
+    problem, terms = fit.problem, cache(partial(_terms, fit, evidence))
+    suspects = evidence.suspects
+    return {
+        **_physical(fit, evidence, warnings),
+        "bias": attempt(
+            "the bias by suspects",
+            lambda: bias_under(terms(), suspects, certify_usual=False) if problem.names else [],
+            warnings,
+            None,
+        ),
+        "measure_detail": fit.measure,
+        "stability": attempt_warned(
+            "the analysis of the free run's sensitivity",
+            lambda: stability(fit.model, problem.record, response=free_run, x=problem.rows.x),
+            warnings,
+        ),
+        "residuals": attempt_warned(
+            "the analysis of the residual",
+            lambda: diagnose(fit, one_step=one_step, free_run=free_run),
+            warnings,
+            _NOT_ANALYSED,
+        ),
+        "missing_lags": attempt_warned(
+            "the search for missing lags", lambda: missing_lags(fit, one_step), warnings
+        ),
+        "budget": attempt_warned(
+            "the bias that the learner implies",
+            lambda: budget_on(terms(), suspects) if _splits(fit) else None,
+            warnings,
+        ),
+    }
+
+
+def _physical(fit: LaggedEstimate, evidence: Evidence, warnings: list[Any]) -> dict[str, Any]:
+    """Return the physical parameters of θ̂ and their findings, where there is a map to them."""
+    if evidence.map is None:
+        return {}
+    physical, profiles, slopes = fit.physical(evidence.map), None, None
+    warnings += physical.warnings
+    if evidence.profiles and physical.covariance is not None:
+        profiles = {name: fit.physical_profile(evidence.map, name) for name in physical.names}
+    if physical.sensitivities is not None:  # ∂ln p / ∂ln θ by name
+        slopes = {
+            name: dict(zip(evidence.map.theta_names, row, strict=True))
+            for name, row in zip(physical.names, physical.sensitivities, strict=True)
+        }
+    return {
+        "physical_parameters": physical_rows(physical, profiles),
+        "physical_consistency": physical.consistency,
+        "sensitivities": slopes,
+    }
+
+
+def _splits(fit: LaggedEstimate) -> bool:
+    """Return whether θ of a fit was split from its learner."""
+    return fit.model.structure == "orthogonal" and fit.learns
+
+
+def _terms(fit: LaggedEstimate, evidence: Evidence) -> LaggedTerms:
+    """Return the physics under the declared measure.
+
+    The rows are weighed by the errors of the fit, or filtered by its noise model, where it has one.
+    """
+    own = fit.problem.weight.kind != evidence.problem.weight.kind or fit.problem.noise is not None
+    problem = fit.problem if own else evidence.problem
+    weighed = weigh_problem(evidence.measure, problem)
+    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
+    return LaggedTerms(weighed, problem, fit.theta, evidence.map, learned, fit.model.shared, fit)
+
+
+def _of_motion(
+    fit: MotionEstimate,
+    evidence: Evidence,
+    one_step: Response,
+    free_run: Response,
+    warnings: list[Any],
+) -> dict[str, Any]:
+    record = fit.problem.record
+    x, u = np.split(fit.reach(record), [fit.model.form.states], axis=1)
+    found: dict[str, Any] = {
+        "residuals": attempt_warned(
+            "the analysis of the residual",
+            lambda: diagnose(fit, one_step=one_step, free_run=free_run),
+            warnings,
+            _RUN_NOT_ANALYSED,
+        ),
+        "stability": attempt_warned(
+            "the analysis of the modes",
+            lambda: motion_stability(fit.model, x, u, record=record),
+            warnings,
+        ),
+    }
+    parts = None
+    if fit.learns:
+        parts = attempt(
+            "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
+        )
+        found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+    coarse = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
+    found["motion"] = describe_physics(fit)["motion"] | {
+        "parts": parts or (),
+        "substep_bias": None if coarse is None else coarse.as_dict(),
+    }
+    table, budget = attempt(
+        "the bias by suspects", lambda: _biases(fit, evidence.suspects), warnings, (None, None)
+    )
+    warnings += budget.warnings if budget else ()
+    return found | {"bias": table, "budget": budget}
+
+
+def _biases(
+    fit: MotionEstimate, suspects: tuple[Any, ...]
+) -> tuple[list[dict[str, Any]] | None, Any]:
+    """Return the table of suspects and of the causes in the budget, and the budget."""
+    terms = linearize_fit(fit)
+    if terms is None:
+        return None, None
+    table = bias_table(terms, suspects)
+    budget = budget_on(terms, suspects, table)
+    listed = {entry.suspect for entry in table}
+    usual = [cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed]
+    return [entry.as_dict() for entry in (*table, *usual)] or None, budget

@@ -1,0 +1,288 @@
+"""Motions with process noise and sensor noise: training of their predictor, and its gain K.
+
+The criterion is the squared innovations of the predictor (`physics/innovations.py`). All that a
+free run is trained by serves: K is among the parameters, the states that segments start from are
+eliminated. The search begins at the free run's parameters, with K = 0 or that of a Kalman filter
+(`scipy.linalg.solve_discrete_are`) for the best of several sizes of process noise.
+
+K is a nuisance. With a = (c, w) and the information G of (c, K, w), `dK = −G_kk⁻¹ G_ka da` where K
+follows a, so that E = d(c, K, w)/da gives the information `EᵀGE` of a alone, its middle `EᵀΩE`, and
+its scores `Eᵀs`. What follows, the split above all, is as for a free run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.errors import InputError, Warning
+from orthaug._base.jax import jnp
+from orthaug._base.progress import LOG, RunProgress
+from orthaug.data.record import Record
+from orthaug.fitting.block_scores import FreeRunScores
+from orthaug.fitting.conclusion import conclude_motion
+from orthaug.fitting.learned import TrainedLearner
+from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.motion_task import MotionTask, descend_from, train_motion_physics
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.segmented_problem import FreeRunFit
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+from orthaug.fitting.structures import Structure
+from orthaug.models.dynamics import Local
+from orthaug.models.predictor import predictor_of
+from orthaug.models.rows import Engine, InMemory
+from orthaug.models.settling import LOOSE
+from orthaug.models.statistics import Statistics
+from orthaug.physics.innovations import InnovationsForm, InnovationsModel, innovations_form
+from orthaug.physics.problem import MotionProblem
+
+_PROCESS = (1e-6, 1e-4, 1e-2, 1.0)  # variance of a state in a sample, of its own, to begin with
+_POINTS = 64  # at which the motion is linearised
+
+
+def predicted_problem(problem: MotionProblem, engine: Engine, *, warm: bool) -> MotionProblem:
+    """Return the problem of a motion's predictor.
+
+    Raises:
+        InputError: what innovations are not for.
+    """
+    if type(engine) is not InMemory:
+        raise InputError(
+            "noise of innovations needs the rows in the memory of this process; take the engine "
+            "memory, or white noise."
+        )
+    if warm:
+        raise InputError(
+            "noise of innovations has no warm start; leave out `initial`, or take white noise."
+        )
+    if problem.motion.source is not None:
+        raise InputError(
+            "noise of innovations needs the motion's equations, and these come from a file; write "
+            "them as [motion], or take white noise."
+        )
+    return replace(problem, motion=innovations_form(problem.motion))
+
+
+@dataclass(frozen=True, eq=False)
+class MarginalScores(FreeRunScores):
+    """Scores of a predictor's run, with the gain K eliminated."""
+
+    moved: Matrix = field(kw_only=True)
+    """E, the derivative of (c, K, w) by (c, w)."""
+
+    @property
+    def followed(self) -> Float[np.ndarray, "k m n0 a"] | None:
+        """How the best states follow (c, w) under the gain of the fit, less its sign."""
+        kept = np.flatnonzero((self.moved == 1.0).any(axis=1))
+        return None if self.slope is None else self.slope[..., kept]
+
+    def blocks(self, steps: int) -> Float[np.ndarray, "b n"]:
+        return super().blocks(steps) @ self.moved
+
+    def slopes(self) -> Float[np.ndarray, "N ny n"]:
+        return super().slopes() @ self.moved
+
+
+@dataclass(frozen=True, eq=False)
+class InnovationsTask(MotionTask):
+    """A motion in innovations form, in segments, and its predictor without a learner."""
+
+    def on(self, record: Record) -> InnovationsTask:
+        return replace(self, plan=super().on(record).plan, physics=None)
+
+    def train_physics_only(
+        self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
+    ) -> tuple[SegmentedMotion, FreeRunFit | None]:
+        problem, plan = self.problem, self.plan
+        plant = replace(problem, motion=problem.motion.plant)
+        free, begun = train_motion_physics(
+            SegmentedMotion.of(plant, plan.bound, plan.criterion, like=plan), solver
+        )
+        plan = replace(plan.with_substeps(free.dynamics.substeps), loose=free.loose)
+        own = plan.physics_only
+        q = plant.motion.coordinates.initial if begun is None else begun.end.point.theta
+        states = free.segments.start if begun is None else begun.end.point.states
+        starts = [np.concatenate([q, gain.ravel()]) for gain in first_gains(free, q, states)]
+        found = descend_from(own.from_states(np.asarray(states)), solver, starts, None, progress)
+        if found is None:
+            return plan, None
+        point = found.end.point
+        states = np.asarray(point.states)
+        x, _ = own.trajectory(point.theta, (), states)
+        size = np.abs(x).max(axis=0, initial=0.0)
+        plan = replace(plan.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
+        if begun is not None:
+            found = found._replace(
+                iterations=begun.iterations + found.iterations,
+                seconds=begun.seconds + found.seconds,
+            )
+        return plan, found
+
+    def conclude(self, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
+        """Return the estimate of the plant under its predictor, with K given."""
+        alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
+        plan, learned = self._with_gain(learned)
+        own = None if alone is None else alone[: len(plan.problem.names)]
+        fit = conclude_motion(plan, structure, learned, own)
+        if not learned.ending.usable or learned.coefficients is None:
+            return fit
+        doubts = check_predictor(plan, learned.coefficients, learned.weights, fit.states)
+        return replace(fit, warnings=(*fit.warnings, *doubts))
+
+    def _with_gain(self, learned: TrainedLearner) -> tuple[SegmentedMotion, TrainedLearner]:
+        """Return the segments of the plant under its predictor, and what it learned."""
+        plan, problem = self.plan, self.problem
+        form: InnovationsForm = problem.motion
+        own, count = form.own, form.own + form.gains
+        assert learned.coefficients is not None
+        gain = learned.coefficients[own:].reshape(len(form.states), len(form.outputs))
+        noise = InnovationsModel(gain)
+        kept = {"coefficients": learned.coefficients[:own]}
+        if learned.gram is not None:
+            moved = follow_gain(learned.gram, own, count)
+            noise = replace(noise, covariance=_of_gain(plan, learned, own, count))
+            kept |= {
+                "gram": moved.T @ learned.gram @ moved,
+                "middle": _Reduced(learned.middle, moved),
+                "scores": _marginal(learned.scores, moved),
+            }
+        plan = replace(
+            plan,
+            problem=replace(problem, motion=form.plant),
+            dynamics=predictor_of(plan.dynamics),
+            predictor=noise,
+        )
+        return plan, replace(learned, **kept)
+
+
+def first_gains(free: SegmentedMotion, q: Vector, states: Any) -> list[Matrix]:
+    """Return gains to begin with: 0, and those of Kalman filters at the parameters q."""
+    own = free.physics_only
+    nx, ny = own.dynamics.states, len(own.dynamics.outputs)
+    found = [np.zeros((nx, ny))]
+    local, size = linearise(own, q, (), states)
+    if local is None:
+        return found
+    a, c = (np.mean(np.asarray(local.to_state), axis=-1)[rows] for rows in (np.s_[:nx], np.s_[nx:]))
+    sensor = np.diag(free.deviation**2) * 1e-3
+    for share in _PROCESS:
+        try:
+            p = scipy.linalg.solve_discrete_are(a.T, c.T, share * np.diag(size**2), sensor)
+        except (np.linalg.LinAlgError, ValueError):  # a mode that no output shows
+            continue
+        found.append(a @ p @ c.T @ np.linalg.inv(c @ p @ c.T + sensor))
+    return [gain for gain in found if np.isfinite(gain).all()]
+
+
+def linearise(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> tuple[Local | None, Vector]:
+    """Return the slopes of steps at some points of the fitted runs, and the sizes of the states.
+
+    None where no point is finite.
+    """
+    scored = np.moveaxis(np.asarray(plan.segments.scored), -1, 1)
+    x = np.moveaxis(plan.runs(c, w, states), -1, 1)[scored]
+    rows = np.moveaxis(np.asarray(plan.segments.inputs), -1, 1)[scored]
+    kept = np.isfinite(x).all(axis=1)
+    x, rows = x[kept], rows[kept]
+    if not len(x):
+        return None, np.ones(plan.dynamics.states)
+    some = np.linspace(0, len(x) - 1, _POINTS).astype(int)
+    size = np.sqrt(np.mean(x**2, axis=0))
+    form, numbers = plan.dynamics, plan.numbers(c, np.asarray(w))
+    local = form.local(form.prepare(numbers), jnp.asarray(x[some].T), jnp.asarray(rows[some].T))
+    return local, np.where(size > 0, size, 1.0)
+
+
+def follow_gain(gram: Matrix, own: int, count: int) -> Float[np.ndarray, "n a"]:
+    """Return E, the derivative of (c, K, w) by (c, w) where K is at its best.
+
+    Args:
+        gram: information of (c, K, w).
+        own: number of c.
+        count: number of c and K.
+    """
+    gains = np.arange(own, count)
+    kept = np.setdiff1d(np.arange(len(gram)), gains)
+    moved = np.zeros((len(gram), len(kept)))
+    moved[kept, np.arange(len(kept))] = 1.0
+    size = np.sqrt(np.maximum(np.diag(gram)[gains], 0.0))
+    unit = 1 / np.where(size > 0, size, 1.0)
+    inner = unit[:, None] * gram[np.ix_(gains, gains)] * unit
+    across = unit[:, None] * gram[np.ix_(gains, kept)]
+    moved[gains] = -unit[:, None] * np.linalg.lstsq(inner, across, rcond=1e-12)[0]
+    return moved
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """ΣψᵀΣ_eψ of (c, w), from that of (c, K, w)."""
+
+    whole: Any
+    moved: Matrix
+
+    def __call__(self, noise: Matrix) -> Matrix:
+        return self.moved.T @ self.whole(noise) @ self.moved
+
+
+def _marginal(scores: FreeRunScores | None, moved: Matrix) -> MarginalScores | None:
+    if scores is None:
+        return None
+    given = {name: getattr(scores, name) for name in FreeRunScores.__dataclass_fields__}
+    return MarginalScores(**given, moved=moved)
+
+
+def _of_gain(plan: SegmentedMotion, learned: TrainedLearner, own: int, count: int) -> Matrix | None:
+    """Return Cov K, row by row."""
+    errors = learned.errors
+    if learned.gram is None or learned.middle is None or errors is None or errors.noise is None:
+        return None
+    middle = learned.middle(plan.problem.weight.whitened(errors.noise))
+    joint = Statistics(learned.gram, middle, errors.noise, learned.ridge).joint(count)
+    assert joint is not None
+    return joint.of(np.eye(len(learned.gram))[own:count])
+
+
+def choose_noise(white: MotionEstimate, coloured: MotionEstimate) -> MotionEstimate:
+    """Return the fit of the lower BIC, of white noise on the outputs and of innovations.
+
+    White noise is the case K = 0, which the result then says.
+    """
+    gain = np.zeros((coloured.model.form.states, len(coloured.model.outputs)))
+    scores = [_bic(white, 0), _bic(coloured, gain.size)]
+    seconds = white.status.seconds + coloured.status.seconds
+    LOG.info("noise: BIC %.6g of white noise, %.6g of innovations", *scores)
+    best = coloured
+    if not scores[1] < scores[0]:
+        best = replace(white, model=replace(white.model, noise=InnovationsModel(gain)))
+    return replace(best, status=replace(best.status, seconds=seconds))
+
+
+def _bic(fit: MotionEstimate, gains: int) -> float:
+    """Return `N log det Σ + (entries of K and effective weights) log N`; infinite without Σ."""
+    noise, rows = fit.model.statistics.noise, fit.segmented.segments.count
+    if noise is None or not fit.status.ok:
+        return np.inf
+    return rows * np.linalg.slogdet(noise)[1] + (gains + fit.effective_weights) * np.log(rows)
+
+
+def check_predictor(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> list[Warning]:
+    """Return a warning where errors of the predictor's states grow from sample to sample."""
+    local, _ = linearise(plan, c, w, states)
+    if local is None:
+        return []
+    slopes = np.moveaxis(np.asarray(local.to_state)[: plan.dynamics.states], -1, 0)
+    slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+    radius = float(np.median(np.abs(np.linalg.eigvals(slopes)).max(axis=1)))
+    if radius < 1:
+        return []
+    text = (
+        f"the predictor is not stable: an error of its states grows by a factor of {radius:.3g} "
+        "a sample. Its predictions depend on where they start. Use more rows, or segments of "
+        "whole experiments."
+    )
+    return [Warning("predictor_unstable", text)]

@@ -1,0 +1,343 @@
+"""The result of a motion's estimation: physical parameters with intervals, model."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from orthaug._base.checks import Matrix, Vector, check_type
+from orthaug._base.errors import Warning
+from orthaug.fitting.estimates import WITHHELD, Estimate
+from orthaug.fitting.field_points import field_under, wobble
+from orthaug.inference.measures import OF_ROWS, Measure, Training
+from orthaug.inference.nearly_shared import enlarge_covariance
+from orthaug.inference.over_experiments import (
+    split_without_each,
+)
+from orthaug.inference.splitting import (
+    MotionSplit,
+    learned_places,
+    slopes_at,
+    split_motion,
+)
+from orthaug.models.dynamics import Numbers
+from orthaug.models.model import Model
+from orthaug.models.motion_field import parts_at
+from orthaug.models.moving import MotionDynamics
+from orthaug.models.statistics import JointCovariance, Statistics, column_units
+from orthaug.physics import ill_conditioned
+from orthaug.physics.excitation import Excitation, of_gram
+from orthaug.physics.problem import MotionProblem
+from orthaug.physics.projection import Projection
+from orthaug.physics.shared import SharedDirections
+
+if TYPE_CHECKING:
+    from orthaug.fitting.segmented_motion import SegmentedMotion
+
+# share of a parameter in directions that no output shows, above which it is not identified
+_UNSEEN = 1e-3
+_VAGUE = 1.0  # standard error of a logarithm above which only the order of magnitude is known
+# times wider an interval without the prior of the weights: the prior is 3/4 of the information
+_LEANING = 2.0
+_ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class MotionEstimate(Estimate):
+    """An `Estimate` of a motion, whose parameters are those of the nearest physics."""
+
+    model: Model[MotionDynamics]
+    problem: MotionProblem = field(repr=False)
+    split_by: MotionSplit = field(repr=False)
+    segmented: SegmentedMotion = field(repr=False)
+    states: Any = field(repr=False)
+    """The segments' starts, as estimated."""
+    slope: Any = field(repr=False)
+    """How they follow the unknowns (k, m, nx, n), less its sign; None where that is not known."""
+    alone: Vector = field(repr=False)
+    """The coordinates of physics alone, where the nearest physics is searched from."""
+    unidentified: tuple[str, ...] = ()
+    """Parameters that no output determines beside the learner, or only the prior of its weights."""
+
+    @property
+    def excitation(self) -> Excitation:
+        """Rank and condition of the parameters in the outputs of the fitted motion."""
+        names, gram = self.problem.names, self.model.statistics.gram
+        count = len(names)
+        if gram is None:
+            return Excitation(0, count, None, ())
+        return of_gram(gram[:count, :count], names)
+
+    @property
+    def shared(self) -> SharedDirections:
+        """The directions of the parameters' coordinates that the learner could imitate."""
+        return self.split_by.shared
+
+    def _more_columns(self) -> dict[str, Any]:
+        names = self.problem.motion.names
+        return {"shared": [name not in self.shared.untouched for name in names]}
+
+    def split(self, measure: Measure, shared: str = "auto") -> MotionEstimate:
+        """Return the same motion with p̂ under another measure over states and inputs.
+
+        Nothing is trained again.
+
+        Args:
+            measure: such as `Uniform({"v": (-1, 1)})`, by the names of states and inputs.
+            shared: "auto" for the directions that the learner could imitate, "all" for all.
+
+        Raises:
+            InputError: a measure that does not fit the motion.
+        """
+        check_type(measure, Measure, "measure", "a measure such as Uniform()")
+        form, segmented = self.model.form, self.segmented
+        whole = fitted_numbers(self.model.numbers)
+        field, support, of_measure = field_under(measure, segmented, whole, self.states)
+        moving = None
+        if isinstance(measure, Training) and self.slope is not None:
+            moving = partial(
+                wobble,
+                segmented.dynamics,
+                whole,
+                segmented.segments,
+                self.states,
+                self.slope,
+                field.size,
+            )
+        bounds = self.problem.motion.coordinates.bounds
+        options = {"everything": shared == "all", "wobble": moving}
+        split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
+        split = replace(split, support=support, of_rows=isinstance(measure, OF_ROWS))
+        return _with_split(self, split, of_measure)
+
+    def _renewed(self) -> MotionEstimate:
+        kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
+        return _with_split(self, self.split_by, kept)
+
+    def moves_by(self) -> tuple[Matrix, Vector] | None:
+        """Return the derivative of the coordinates by (c, w), and which of these move.
+
+        None without statistics.
+        """
+        made, follows = free_covariance(self), self.split_by.follows()
+        return None if made is None or follows is None else (follows, made[1])
+
+    def _changes_without_each(self) -> Matrix | None:
+        free_run = self.criterion.free_run
+        assert free_run is not None, "a motion is trained on its free run"
+        changes = self._changes_of_free_run(free_run)
+        if changes is None or not self.learns:
+            return changes
+        owner, field = self.segmented.recording_of_points(), self.split_by.field
+        if not self.split_by.of_rows or len(field.x) % len(owner):
+            return changes
+        basis, motion = self.shared.basis, self.problem.motion
+        slopes = np.asarray(
+            slopes_at(self.segmented.dynamics.physics_only, self.theta, field.x, field.u)
+        )[:, learned_places(motion)]
+        unit = np.sqrt(field.weight)[:, None] / field.size
+        values = parts_at(self.model.form, self.model.numbers, field.x, field.u)[1]
+        every = np.tile(owner, len(field.x) // len(owner))
+        found = split_without_each(
+            Projection.factor(slopes * unit[..., None]), basis, values * unit, every, len(changes)
+        )
+        return None if found is None else changes + found
+
+    def _heading(self) -> list[str]:
+        motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
+        seen = ", ".join(str(entry) for entry in form.features)
+        learner, split = str(bound), []
+        if self.learns:
+            learner = (
+                f"{bound.learner} of {seen}, {bound.size} weights, "
+                f"{self.effective_weights:.1f} effective"
+            )
+            split = [
+                f"shared      {shared_in_words(self.shared)}",
+                f"measure     {self.split_by.name}",
+            ]
+        steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
+        lines = [
+            f"motion      {', '.join(motion.names_of_states)}; {motion.integrator}, {steps}, "
+            f"{motion.hold} hold",
+            f"learner     {learner}",
+            f"data        {self.problem.record!r}",
+            *self.status.lines,
+            *split,
+        ]
+        return lines
+
+
+def fitted_numbers(numbers: Numbers) -> Numbers:
+    """Return the numbers before any split: θ is the one fitted beside the learner."""
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
+
+
+def _with_split(
+    fit: MotionEstimate, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
+) -> MotionEstimate:
+    """Return the estimate with p̂, intervals and warnings of a split."""
+    motion, numbers = fit.problem.motion, fit.model.numbers
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    bounds = motion.coordinates.bounds
+    values = motion.coordinates.physical(split.q)
+    at_bound = {
+        n: float(value)
+        for n, value, q, low, high in zip(motion.names, values, split.q, *bounds, strict=True)
+        if q <= low or q >= high
+    }
+    covariance, unseen = _covariance(fit, fit.model.statistics, split, at_bound)
+    plain = fit.plain_covariance
+    if plain is not None and fit.plain_statistics is not None:
+        plain = _covariance(fit, fit.plain_statistics, split, at_bound)[0]
+    warnings = [
+        *of_measure,
+        *_ill_conditioned(fit, split),
+        *_doubts(split, at_bound, unseen, fit.learns),
+    ]
+    model = replace(
+        fit.model,
+        numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
+        measure=split.name,
+    )
+    own = {"ill_conditioned", "not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
+    return replace(
+        fit,
+        model=model,
+        covariance=None if fit.std_kind in WITHHELD else covariance,
+        plain_covariance=plain,
+        defect=split.defect,
+        split_by=split,
+        at_bound=at_bound,
+        unidentified=unseen,
+        warnings=(*(w for w in fit.warnings if w.code not in own), *warnings),
+    )
+
+
+def _ill_conditioned(fit: MotionEstimate, split: MotionSplit) -> list[Warning]:
+    gram, noise, count = fit.model.statistics.gram, fit.model.statistics.noise, len(split.q)
+    return (
+        []
+        if gram is None or noise is None
+        else ill_conditioned.of_motion(fit.problem, gram[:count, :count], split.q, noise)
+    )
+
+
+def _covariance(
+    fit: MotionEstimate, statistics: Statistics, split: MotionSplit, at_bound: Collection[str]
+) -> tuple[Matrix | None, tuple[str, ...]]:
+    """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
+
+    No output determines these, or only the prior of the weights does.
+    """
+    names, made = fit.problem.motion.names, free_covariance(fit, statistics)
+    if split.slope is None or made is None:
+        return None, ()
+    joint, moves = made
+    slope = split.slope[:, moves]
+    covariance = joint.of(slope)
+    std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
+    vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
+    unseen = tuple(
+        name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
+    )
+    for i, name in enumerate(names):
+        if name in unseen or name in at_bound:
+            covariance[i] = covariance[:, i] = np.nan
+    return enlarge_covariance(covariance, statistics, split.shared), unseen
+
+
+def free_covariance(
+    fit: MotionEstimate, statistics: Statistics | None = None
+) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
+    """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
+
+    None without statistics, by default the model's.
+    """
+    numbers = fit.model.numbers
+    statistics = fit.model.statistics if statistics is None else statistics
+    if statistics.gram is None or statistics.middle is None:
+        return None
+    c = np.asarray(numbers.theta - numbers.theta_aux)
+    low, high = fit.problem.motion.coordinates.bounds
+    moves = np.concatenate(
+        [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]
+    )
+    kept = np.ix_(moves, moves)  # an entry at a bound is a constant
+    own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
+    joint = own.joint(int(moves[: len(c)].sum()))
+    return None if joint is None else (joint, moves)
+
+
+def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
+    """Return how many times wider intervals of K (c, w) are without the ridge on w (m,).
+
+    Inf where the data do not determine them.
+
+    Both for white noise: the question is where the information comes from.
+    """
+    gram = joint.gram
+    unit = column_units(gram, joint.nt)
+    values, vectors = np.linalg.eigh(gram * np.outer(unit, unit))
+    hidden = vectors[:, values <= _ROUNDING * values.max(initial=0.0)]
+    own = slope * unit
+    share = np.linalg.norm(own @ hidden, axis=1) / np.maximum(np.linalg.norm(own, axis=1), 1e-300)
+    white = replace(joint, middle=gram)
+    with_prior, by_data = (
+        np.sqrt(np.diag(one.of(slope))) for one in (white, replace(white, ridge=0.0))
+    )
+    wider = by_data / np.where(with_prior > 0, with_prior, 1.0)
+    return np.where(share > _UNSEEN, np.inf, np.maximum(wider, 1.0))
+
+
+def _doubts(
+    split: MotionSplit, at_bound: Collection[str], unseen: tuple[str, ...], learns: bool
+) -> list[Warning]:
+    warnings = []
+    if split.slope is None:
+        text = (
+            "the distance between the fitted motion and the physics has no unique minimum near "
+            f"the estimate, so there are no intervals. Its curvature is {split.curvature:.2g} "
+            "of that at a good fit: several parameters could explain what the learner found."
+        )
+        warnings.append(Warning("not_unique", text))
+    if at_bound:
+        text = (
+            f"at a bound: {', '.join(at_bound)}. A parameter at a bound has no interval, and "
+            "the other estimates hold for this value of it. Where the data contradict a bound, "
+            "the bound or the physics is wrong."
+        )
+        warnings.append(Warning("at_a_bound", text))
+    if unseen:
+        text = (
+            f"not identified: {', '.join(unseen)}. Other values, with other weights of the "
+            "learner, give nearly the same outputs, and only the prior of the weights decides, "
+            "so there is no interval. Measure more, fix one of them as a constant, give the "
+            "learner fewer inputs, or add it to fewer equations."
+        )
+        if not learns:
+            text = (
+                f"not identified: {', '.join(unseen)}. Other values of them together give the "
+                "same outputs, so there is no interval; give some of them as constants."
+            )
+        warnings.append(Warning("not_identified", text))
+    return warnings
+
+
+def shared_in_words(shared: SharedDirections) -> str:
+    """Return the directions that the learner could imitate, in words."""
+    if not shared.basis.size:
+        return "nothing: the data determine all parameters"
+    if shared.all:
+        return "all parameters: they are those of the physics nearest to the fitted motion"
+    moved = [" with ".join(direction) for direction in shared.directions]
+    return (
+        f"{'; '.join(moved)} (by the nearest physics); determined by the fit: "
+        f"{', '.join(shared.untouched) or 'none'}"
+    )

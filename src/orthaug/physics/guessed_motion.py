@@ -1,0 +1,230 @@
+"""A motion at the states that its record suggests, before any training.
+
+States are as they are declared, from what is measured about a row. An output and its derivative are
+those of a local polynomial (Savitzky and Golay 1964), what nothing is said of starts at zero.
+Training and simulation go on from there: a start is an unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError
+from orthaug.data.expressions import Lag
+from orthaug.data.record import Record
+from orthaug.physics.motion import MOST_SUBSTEPS, Motion
+
+_LOOKED_AT = 200  # rows at which the equations are looked at
+# [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
+_TURNED = 100.0
+# Real part times the sampling time: of an oscillation less than 1 % is left at the next sample
+_GONE = -5.0
+_FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
+_GROWS = 10.0  # by a factor of e^10 over the record, a mode grows
+_STEP = 1e-6  # relative, of differences
+_ROWS, _DEGREE = 9, 2  # of a local polynomial
+
+
+@dataclass(frozen=True, eq=False)
+class GuessedMotion:
+    """A motion with a record: its equations and modes at guessed states."""
+
+    record: Record
+    motion: Motion
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return tuple(channel.name for channel in self.record.outputs)
+
+    @cached_property
+    def guessed_points(self) -> tuple[Float[np.ndarray, "nx m"], Float[np.ndarray, "nu m"]]:
+        """Guessed states and inputs at some rows of the record."""
+        states, inputs = [], []
+        share = max(1, _LOOKED_AT // len(self.record.experiments))
+        for experiment in self.record.experiments:
+            rows = np.unique(np.linspace(0, len(experiment) - 1, share).astype(int))
+            states.append(guess(self.motion, experiment.outputs, rows, self.record.sampling_time))
+            inputs.append(experiment.inputs[rows])
+        x, u = np.concatenate(states).T, np.concatenate(inputs).T
+        with np.errstate(all="ignore"):
+            return x, np.asarray(self.motion.inputs_at(x, u, self.motion.initial, np))
+
+    def without_value(self, over: Callable[[Any], Any]) -> str:
+        """Return the first equation or output that is not finite at the start, as text.
+
+        Either at all guessed states, or at any of them.
+
+        Args:
+            over: np.all or np.any.
+
+        Raises:
+            InputError: functions that return another shape.
+        """
+        motion, (x, u) = self.motion, self.guessed_points
+        with np.errstate(all="ignore"):
+            rates = np.asarray(motion.rates(x, u, motion.initial, np), dtype=float)
+            outputs = np.asarray(motion.observed(x, u, motion.initial, np), dtype=float)
+        for names, values, what, first in (
+            (motion.names_of_states, rates, "the equation of", 0),
+            (self.outputs, outputs, "the output", len(rates)),
+        ):
+            if values.shape != (len(names), x.shape[1]):
+                raise InputError(
+                    f"the motion's functions return shape {values.shape}; expected "
+                    f"({len(names)}, …)."
+                )
+            for i, name in enumerate(names):
+                lost = ~np.isfinite(values[i])
+                if over(lost):
+                    k = int(np.argmax(lost))
+                    at = zip(
+                        (*motion.names_of_states, *motion.inputs), (*x[:, k], *u[:, k]), strict=True
+                    )
+                    where = ", ".join(f"{n} = {v:.4g}" for n, v in at)
+                    term = motion.term_without_value(first + i, x[:, k], u[:, k])
+                    reason = f": {term}" if term else ""
+                    return (
+                        f"{what} '{name}' is not finite at the start ({where}, initial "
+                        f"parameters){reason}"
+                    )
+        return ""
+
+    @cached_property
+    def modes(self) -> Complex[np.ndarray, "m nx"]:
+        """Eigenvalues of ∂f/∂x [1/s] at the initial parameters and the finite guessed states."""
+        x, u = self.guessed_points
+        size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
+        columns = []
+        with np.errstate(all="ignore"):
+            for i, h in enumerate(_STEP * size):
+                moved = np.zeros_like(x)
+                moved[i] = h
+                ends = (
+                    np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np))
+                    for s in (1, -1)
+                )
+                columns.append((next(ends) - next(ends)) / (2 * h))
+        slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
+        slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+        return np.linalg.eigvals(slopes).astype(complex)
+
+    @property
+    def fastest(self) -> float:
+        """Largest |eigenvalue| of ∂f/∂x [1/s] at the initial parameters and guessed states."""
+        return float(np.abs(self.modes).max(initial=0.0))
+
+    @property
+    def grows(self) -> str:
+        """A clause on the fastest growing mode at the start, with a remedy; empty without one."""
+        modes: Any = self.modes
+        if self.motion.scheme.discrete and modes.size:
+            with np.errstate(all="ignore"):
+                modes = np.log(modes) / self.record.sampling_time
+        fastest = float(modes.real.max(initial=0.0))
+        if self.motion.held or not fastest > _GROWS / len(self.record) / self.record.sampling_time:
+            return ""
+        return (
+            f"a mode of the motion grows by {fastest:.3g} 1/s at the initial parameters. If a "
+            "controller held the plant, give `controller` and the reference as input"
+        )
+
+    @property
+    def substeps(self) -> int:
+        """Substeps per sample with which training begins."""
+        motion = self.motion
+        if motion.scheme.discrete:
+            return 1
+        if motion.substeps is not None:
+            return motion.substeps
+        return motion.scheme.first_substeps(self.fastest * self.record.longest_step)
+
+
+def check_start(problem: GuessedMotion) -> None:
+    """Raise InputError where equations have no value at the start, or a mode is too fast."""
+    motion, where = problem.motion, problem.without_value(np.all)
+    if where:
+        raise InputError(f"{where}; correct it, or change the initial values.")
+    if motion.scheme.widest_angle is not None and problem.substeps > MOST_SUBSTEPS:
+        raise InputError(
+            f"the sampling time of {problem.record.longest_step:g} s is too long for the "
+            f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
+            f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
+            '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+        )
+    if motion.scheme.splits_linear_part:
+        _check_exact(problem)
+
+
+def _check_exact(problem: GuessedMotion) -> None:
+    """Raise InputError for modes that samples do not show, or whose exponential has no digits."""
+    sampling_time = problem.record.sampling_time
+    modes: Any = problem.modes
+    lasting = modes[modes.real * sampling_time > _GONE]
+    turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
+    fast = problem.fastest * sampling_time / problem.substeps
+    if turned > _TURNED:
+        raise InputError(
+            "at the initial parameters a mode of the motion oscillates with "
+            f"{turned / sampling_time:.3g} rad/s, {turned / (2 * np.pi):.3g} periods in a "
+            f"sample of {sampling_time:g} s: the data cannot determine it. Check units and "
+            "initial values, sample faster, or leave the fast mode out."
+        )
+    if fast > _FASTEST:
+        raise InputError(
+            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the "
+            f'motion, {problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a '
+            f"substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), check units "
+            "and initial values, or leave the fast mode out."
+        )
+
+
+def guess(
+    motion: Motion,
+    outputs: Matrix,
+    rows: Sequence[int] | Int[np.ndarray, "r"],
+    sampling_time: float,
+) -> Float[np.ndarray, "r n0"]:
+    """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
+    rows = np.asarray(rows, dtype=int)
+    width = min(_ROWS, len(outputs))
+    begin = np.clip(rows - width // 2, 0, len(outputs) - width)
+    level = np.zeros((2, len(rows), outputs.shape[1]))
+    if width:
+        there = outputs[begin[:, None] + np.arange(width)]
+        fitted = _polynomials(width)[rows - begin] @ there  # (r, degree + 1, ny)
+        level[: fitted.shape[1]] = np.moveaxis(fitted[:, :2], 1, 0)
+    names = [output.name for output in motion.outputs]
+    states = np.zeros((len(rows), len(motion.states)))
+    for i, state in enumerate(motion.states):
+        source = state.from_output
+        if source is not None:
+            states[:, i] = level[source[1], :, names.index(source[0])] / sampling_time ** source[1]
+        elif state.start is not None:
+            states[:, i] = float(state.start)
+    return states
+
+
+@cache
+def _polynomials(width: int) -> Float[np.ndarray, "width degree+1 width"]:
+    """Return a map from the values of all rows to a local polynomial about each row."""
+    offset = np.arange(width)[None, :] - np.arange(width)[:, None]
+    return np.linalg.pinv(offset[..., None] ** np.arange(min(_DEGREE, width - 1) + 1))
+
+
+class SignalName(Lag):
+    """A state or an input as a measure names it: at the present instant, without an index."""
+
+    def __str__(self) -> str:
+        return self.channel
+
+
+def layout_of(motion: Motion) -> tuple[SignalName, ...]:
+    """Return the names of states, then inputs."""
+    return tuple(SignalName(name, 0) for name in (*motion.names_of_states, *motion.inputs))
