@@ -34,7 +34,16 @@ else:
     Array = Any
 
 _LENGTH = hashlib.sha256().digest_size
-__all__ = ["Array", "is_traced", "jax", "jnp", "padded_length", "starts", "use_compilation_cache"]
+__all__ = [
+    "Array",
+    "is_traced",
+    "jax",
+    "jnp",
+    "padded_length",
+    "quick_jit",
+    "starts",
+    "use_compilation_cache",
+]
 
 
 def _real_jax() -> Any:
@@ -72,20 +81,90 @@ class _LazyModule:
         return value
 
 
+# What XLA leaves out where the data are small. Compiling takes half as long, and runs take as long
+# as before (benchmarks/compile_effort.py)
+_LESS_EFFORT = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_llvm_disable_expensive_passes": True,
+}
+# For what runs a few times only: a quarter of the time to compile, and runs take four times as long
+_LEAST_EFFORT = {**_LESS_EFFORT, "xla_backend_optimization_level": 0}
+_SMALL = 1 << 15  # numbers in an argument: with more, runs are worth any time to compile
+
+
+class _Compiled:
+    """A function that JAX compiles when it is first called, with less effort for small arguments.
+
+    Compiling takes a second or two for each program and is most of what a first fit takes. JAX
+    takes such options for a whole program only, so inside another one the function is compiled as
+    that one is. Where this version of JAX or the platform has no such options, they are left out.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], effort: dict[str, Any], options: dict[str, Any]
+    ) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self._effort, self._options = function, effort, options
+        self._lock = threading.Lock()
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if _are_small((args, kwargs)) and _efforts_known():
+            try:
+                return self._with_less_effort(*args, **kwargs)
+            except ValueError as error:  # called while another program is traced
+                if "compiler_options" not in str(error):
+                    raise
+        return self._plain(*args, **kwargs)
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        return self if instance is None else functools.partial(self, instance)
+
+    @functools.cached_property
+    def _plain(self) -> Callable[..., Any]:
+        with self._lock:
+            return _real_jax().jit(self._function, **self._options)
+
+    @functools.cached_property
+    def _with_less_effort(self) -> Callable[..., Any]:
+        with self._lock:
+            options = {"compiler_options": self._effort, **self._options}
+            return _real_jax().jit(self._function, **options)
+
+
 def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Return `jax.jit(function, **options)`, made at the first call."""
-    made: list[Callable[..., Any]] = []
-    one_at_a_time = threading.Lock()
+    return _Compiled(function, _LESS_EFFORT, options)
 
-    @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        if not made:
-            with one_at_a_time:
-                if not made:
-                    made.append(_real_jax().jit(function, **options))
-        return made[0](*args, **kwargs)
 
-    return call
+def quick_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Return `jax.jit(function, **options)` for a program that runs a few times only.
+
+    On small data it is compiled with the least effort.
+    """
+    return _Compiled(function, _LEAST_EFFORT, options)
+
+
+@functools.cache
+def _efforts_known() -> bool:
+    """Return whether this JAX compiles for a processor and knows the options of less effort."""
+    real = _real_jax()
+    if real.default_backend() != "cpu":
+        return False
+    try:
+        real.jit(lambda x: x + 1).lower(1.0).compile(_LEAST_EFFORT)
+    except Exception:  # JAX has an error of its own for an option that it does not know
+        return False
+    return True
+
+
+def _are_small(arguments: Any) -> bool:
+    """Return whether all arguments are known and small."""
+    from jax.core import Tracer
+
+    for leaf in _real_jax().tree.leaves(arguments):
+        if isinstance(leaf, Tracer) or getattr(leaf, "size", 0) > _SMALL:
+            return False
+    return True
 
 
 def starts() -> bool:

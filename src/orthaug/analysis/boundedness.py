@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import check_number
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp, padded_length, quick_jit
 from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -178,7 +178,7 @@ def _find_diverging(
     return wild[: len(factors)]
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _side_by_side(
     form: Dynamics,
     numbers: Numbers,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.visited import (
     MOST_STEPS,
     RunPoint,
@@ -72,7 +72,7 @@ def by_differences(function: Any, point: Any, width: Any) -> Any:
     return ((each(point + aside) - each(point - aside)) / (2 * width[:, None])).T
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _transitions(
     form: Dynamics,
     numbers: Numbers,

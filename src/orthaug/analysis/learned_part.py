@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.fitting.motion_estimate import MotionEstimate, free_covariance
 from orthaug.inference.covariance import reach
 from orthaug.inference.splitting import rest_of
@@ -67,7 +67,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
     return reach(fit.freedom) * np.linalg.norm(follows, axis=-1)
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:

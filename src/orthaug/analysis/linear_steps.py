@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Vector
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.feedback import by_differences
 from orthaug.models.dynamics import Numbers
 from orthaug.models.filters import LaggedFilter
@@ -195,7 +195,7 @@ def sizes_of(model: Model) -> Vector:
     return np.where(np.isfinite(size) & (size > 0), size, 1.0)
 
 
-@partial(jax.jit, static_argnames="step")
+@partial(quick_jit, static_argnames="step")
 def at_rest(
     step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any
 ) -> tuple[Any, Any, Any]:
@@ -224,7 +224,7 @@ def _replace_unknowns(numbers: Numbers, unknowns: Any) -> Numbers:
     return numbers._replace(theta=unknowns[:nt], weights=weights)
 
 
-@partial(jax.jit, static_argnames="step")
+@partial(quick_jit, static_argnames="step")
 def unrest_along(
     step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any
 ) -> Float[Array, "m r"]:
@@ -258,7 +258,7 @@ def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, wi
     )
 
 
-@partial(jax.jit, static_argnames="step")
+@partial(quick_jit, static_argnames="step")
 def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
     """Return `[A B]` by differences to each side, (2, n, k), and their reach, (k,)."""
     both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
@@ -270,7 +270,7 @@ def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) 
     return jnp.stack([side.T[:n] for side in sides]), full
 
 
-@partial(jax.jit, static_argnames=("step", "field"))
+@partial(quick_jit, static_argnames=("step", "field"))
 def slope_at(
     step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any
 ) -> Float[Array, "m n"]:
@@ -278,7 +278,7 @@ def slope_at(
     return _slope(step, field, numbers, rest, inputs, width)
 
 
-@partial(jax.jit, static_argnames=("step", "field"))
+@partial(quick_jit, static_argnames=("step", "field"))
 def slope_along(
     step: Step,
     field: bool,

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.feedback import by_differences, difference_width
 from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, even_indices, positive, usable
 from orthaug.data.record import Record
@@ -139,7 +139,7 @@ def _gradients(form: LaggedDynamics, numbers: Numbers, x: Matrix) -> Iterator[li
         ]
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _gradient_rows(
     form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Any
 ) -> tuple[Array, Array]:
@@ -177,7 +177,7 @@ def _weight_sizes(
     return some, np.sqrt(every.sum(axis=(1, 2))), np.sqrt(scaled.sum(axis=(1, 2)))
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _weight_squares(
     form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], direction: Float[Array, "nx"]
 ) -> Float[Array, "m ny"]:

@@ -23,7 +23,7 @@ import scipy.special
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, padded_length
+from orthaug._base.jax import Array, padded_length, quick_jit
 from orthaug.analysis.suspects import changes_sign
 from orthaug.fitting.motion_estimate import MotionEstimate, fitted_numbers
 from orthaug.fitting.whiteness import whitening_filter
@@ -56,7 +56,7 @@ class Sensitivities:
     """n0, and n0 + n."""
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _slopes(
     form: MotionDynamics,
     numbers: Numbers,

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug._base.lines import percent
 from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
 from orthaug.analysis.boundedness import divergence_scaling, margin
@@ -187,7 +187,7 @@ def modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> Modes | None:
     )
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nx nx"]:

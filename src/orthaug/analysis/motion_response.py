@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug._base.lines import percent
 from orthaug.analysis.absorbed import Waves
 from orthaug.fitting.block_scores import FreeRunScores
@@ -233,7 +233,7 @@ def solve_scaled(matrix: Matrix, right: Vector) -> Vector:
     return scale * (vectors @ ((vectors.T @ (scale * right)) / values[kept]))
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _learned_change(
     form: MotionDynamics,
     numbers: Numbers,

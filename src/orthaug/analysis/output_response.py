@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp, padded_length
+from orthaug._base.jax import jax, jnp, padded_length, quick_jit
 from orthaug.data.record import Record
 from orthaug.fitting.whiteness import LARGEST
 from orthaug.models.model import Model
@@ -113,7 +113,7 @@ def _linearize(
     return LinearRun(states, inputs, read, outputs - run, a, c, b, d)
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _linearise_run(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
     """Return states, outputs, and the slopes of both, at every row of a free run.
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector, check_choice, check_unique
 from orthaug._base.errors import InputError
-from orthaug._base.jax import Array, jax
+from orthaug._base.jax import Array, jax, quick_jit
 from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.regressors import in_order, largest_lag
@@ -301,7 +301,7 @@ def _remove_starts(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return (own - q @ (np.swapaxes(q, 1, 2) @ own)).reshape(shape)
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _run(
     form: MotionDynamics,
     numbers: Numbers,

@@ -327,7 +327,7 @@ class Trials:
         None where training failed, or the fit is not accepted.
         """
         try:
-            fit = job.fold_fit(variant)(self.rows.training)
+            fit = job.fold_fit(variant, briefly=True)(self.rows.training)
             if not fit.status.ok or not accepts(fit):
                 return None
             return squared_errors(fit.model.simulate(self.rows.held), self.unit, self.rows.skips)

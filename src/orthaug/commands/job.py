@@ -280,13 +280,15 @@ class Job:
             **self.training_options(variant),
         )
 
-    def fold_fit(self, variant: Variant) -> Callable[[Record], Any]:
+    def fold_fit(self, variant: Variant, *, briefly: bool = False) -> Callable[[Record], Any]:
         """Return a function that trains a variant on a fold.
 
-        It is scored by predictions, on which the measure has no effect.
+        It is scored by predictions, on which the measure has no effect, or `briefly` by free runs
+        only.
         """
         options = self.training_options(variant.on(self.train.record))
         options["structure"] = self.spec.declared_structure(variant.structure_kind)
+        options["briefly"] = briefly
         posed, train = self.physics.fold_training(self, variant)
         return partial(_fit_fold, posed=posed, train=train, options=options)
 

@@ -371,7 +371,12 @@ _TRIED_ROWS = 1000  # on which windows are compared
 
 
 def conclude_motion(
-    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner, alone: Vector | None
+    plan: SegmentedMotion,
+    structure: Structure,
+    learned: TrainedLearner,
+    alone: Vector | None,
+    *,
+    briefly: bool = False,
 ) -> MotionEstimate:
     """Split the fitted motion and attach statistics.
 
@@ -379,6 +384,8 @@ def conclude_motion(
         plan: the segments that were trained on.
         learned: of these segments.
         alone: coordinates of physics alone; None where no run of it is finite.
+        briefly: leave out the split and the choice of a window to predict from, which no free run
+            depends on and which take longer than a short training.
     """
     problem, begins = plan.problem, alone is not None
     assert learned.coefficients is not None and learned.errors is not None
@@ -391,7 +398,7 @@ def conclude_motion(
     alone = np.asarray(learned.coefficients if alone is None else alone)
     layout = (plan.free_run.steps, plan.free_run.washout, plan.segments.count)
     trained = TrainedSegments(*layout, np.asarray(states), slope, alone)
-    model = replace(_motion_model(plan, structure, learned), trained=trained)
+    model = replace(_motion_model(plan, structure, learned, briefly), trained=trained)
     status = _status(learned, learned.ending, errors, physics=not (learned.bound.learns and begins))
     if status.reason and not (learned.ending.usable or learned.bound.learns and begins):
         if where := problem.without_value(np.any):
@@ -420,7 +427,7 @@ def conclude_motion(
     )
     return (
         fit.split(structure.measure, getattr(structure, "shared", "auto"))
-        if learned.ending.usable
+        if learned.ending.usable and not briefly
         else fit
     )
 
@@ -442,7 +449,7 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
 
 
 def _motion_model(
-    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner
+    plan: SegmentedMotion, structure: Structure, learned: TrainedLearner, briefly: bool
 ) -> Model[MotionDynamics]:
     assert learned.coefficients is not None and learned.errors is not None
     noise = learned.errors.noise
@@ -458,7 +465,7 @@ def _motion_model(
     )
     if not learned.ending.usable:
         return model
-    if plan.predictor is None:  # a predictor forgets where it began
+    if plan.predictor is None and not briefly:  # a predictor forgets where it began
         model = _with_window(model, _best_window(model, plan.record))
     return (
         model
@@ -536,6 +543,15 @@ def _kept_gain(model: Model[MotionDynamics]) -> InnovationsModel | None:
     return noise if isinstance(noise, InnovationsModel) and not noise.white else None
 
 
+def _pad_segments(part: Any, segmented: SegmentedMotion) -> Any:
+    """Return an array (…, m) of an earlier version, which padded a single segment with none."""
+    width = np.shape(segmented.segments.start)[-1]
+    if part is None or np.shape(part)[-1] >= width:
+        return part
+    room = ((0, 0),) * (np.ndim(part) - 1) + ((0, width - np.shape(part)[-1]),)
+    return np.pad(part, room)
+
+
 def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstimate:
     """Return the estimate of a saved model with its training data, to split again.
 
@@ -560,8 +576,9 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
         scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
         unit=np.asarray(numbers.gain),
     )
+    states, slope = (_pad_segments(part, segmented) for part in (kept.states, kept.slope))
     if segmented.segments.count != kept.rows or np.shape(segmented.segments.start) != np.shape(
-        kept.states
+        states
     ):
         raise InputError(
             f"the model was trained on other rows: {kept.rows} instead of "
@@ -581,7 +598,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
         criterion=criterion,
         split_by=MotionSplit.empty(model.measure, form, c),
         segmented=segmented,
-        states=kept.states,
-        slope=kept.slope,
+        states=states,
+        slope=slope,
         alone=np.asarray(kept.alone),
     )

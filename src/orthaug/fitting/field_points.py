@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.splitting import Field, beyond_data, rest_of
@@ -101,7 +101,7 @@ def wobble(
     return total / segments.count
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _sum_over(
     form: MotionDynamics,
     numbers: Numbers,

@@ -80,6 +80,8 @@ class Request:
     engine: Engine = InMemory()  # noqa: RUF009  (frozen)
     checkpoints: Checkpoints | None = None
     noise: Noise = "white"
+    briefly: bool = False
+    """Whether the model only has to simulate: its θ is not split, and it has no intervals."""
 
     @property
     def warm(self) -> bool:
@@ -174,7 +176,7 @@ class FitPlan(ABC, Generic[P]):
         """Return how the best run is chosen; `auto` for regularizations that "auto" declares."""
         request = self.request
         blocks = 0 if request.warm else request.blocks
-        return Choice(request.validation, blocks, request.fallback)
+        return Choice(request.validation, blocks, request.fallback, briefly=request.briefly)
 
     def solve(self, task: Any) -> Estimate | None:
         """Return the estimate of a task that is solved; None where it is trained."""

@@ -298,7 +298,9 @@ class FreeRunTask(SimulationTask):
             self.physics is None or square <= self.physics.mean_square
         )
 
-    def conclude(self, structure: Structure, learned: TrainedLearner) -> LaggedEstimate:
+    def conclude(
+        self, structure: Structure, learned: TrainedLearner, *, briefly: bool = False
+    ) -> LaggedEstimate:
         """Return the estimate of what a run learned, on the rows of its problem."""
         return replace(self.rows_task.conclude(structure, learned), criterion=self.criterion)
 

@@ -123,13 +123,15 @@ class InnovationsTask(MotionTask):
             )
         return plan, found
 
-    def conclude(self, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
+    def conclude(
+        self, structure: Structure, learned: TrainedLearner, *, briefly: bool = False
+    ) -> MotionEstimate:
         """Return the estimate of the plant under its predictor, with K given."""
         alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
         plan, learned = self._with_gain(learned)
         own = None if alone is None else alone[: len(plan.problem.names)]
-        fit = conclude_motion(plan, structure, learned, own)
-        if not learned.ending.usable or learned.coefficients is None:
+        fit = conclude_motion(plan, structure, learned, own, briefly=briefly)
+        if briefly or not learned.ending.usable or learned.coefficients is None:
             return fit
         doubts = check_predictor(plan, learned.coefficients, learned.weights, fit.states)
         return replace(fit, warnings=(*fit.warnings, *doubts))

@@ -136,8 +136,10 @@ class Task(Protocol):
         """Return the learner as a run left it."""
         ...
 
-    def conclude(self, structure: Structure, learned: TrainedLearner) -> Any:
-        """Return the estimate of what a run learned."""
+    def conclude(
+        self, structure: Structure, learned: TrainedLearner, *, briefly: bool = False
+    ) -> Any:
+        """Return the estimate of what a run learned; `briefly` only what a free run needs."""
         ...
 
     def median(self, members: list[TrainedLearner], best: int) -> TrainedLearner:

@@ -280,10 +280,12 @@ class MotionTask(SimulationTask):
             run._replace(end=end._replace(linear=end.linear._replace(information=information)))
         )
 
-    def conclude(self, structure: Structure, learned: TrainedLearner) -> MotionEstimate:
+    def conclude(
+        self, structure: Structure, learned: TrainedLearner, *, briefly: bool = False
+    ) -> MotionEstimate:
         """Return the estimate of what a run learned."""
         alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
-        return conclude_motion(self.plan, structure, learned, alone)
+        return conclude_motion(self.plan, structure, learned, alone, briefly=briefly)
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress

@@ -356,7 +356,9 @@ class OneStepTask(TrainingRows):
             middle=lambda noise: self.middle(none, noise),
         )
 
-    def conclude(self, structure: Structure, learned: TrainedLearner) -> LaggedEstimate:
+    def conclude(
+        self, structure: Structure, learned: TrainedLearner, *, briefly: bool = False
+    ) -> LaggedEstimate:
         """Return the estimate of what a run learned."""
         return conclude(self, structure, learned)
 

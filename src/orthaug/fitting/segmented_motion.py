@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax
+from orthaug._base.jax import Array, jax, quick_jit
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
@@ -53,6 +53,8 @@ class SegmentedMotion(SegmentedProblem):
     loose: Vector
     predictor: InnovationsModel | None = None
     """The noise model whose gain is given to a predictor; None for other dynamics."""
+    like: SegmentedMotion | None = None
+    """The layout whose shapes this one has, so that the same programs run over both."""
 
     @classmethod
     def of(
@@ -93,6 +95,7 @@ class SegmentedMotion(SegmentedProblem):
             problem=problem,
             loose=LOOSE * sizes(problem),
             predictor=predictor,
+            like=like,
         )
 
     def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
@@ -126,7 +129,8 @@ class SegmentedMotion(SegmentedProblem):
 
         0 for whole experiments.
         """
-        segments = build_segments(self.record, self.dynamics, segment, 0, shares=self.shares)
+        shape = None if self.like is None else self.like.over(segment).segments
+        segments = build_segments(self.record, self.dynamics, segment, 0, shape, self.shares)
         return replace(
             self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
         )
@@ -287,7 +291,7 @@ def sizes(problem: MotionProblem) -> Vector:
     return np.where(size > 0, size, 1.0)
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _states(
     form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
 ) -> Any:

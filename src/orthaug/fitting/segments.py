@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers
 from orthaug.models.rows import gram
@@ -21,6 +21,7 @@ from orthaug.models.rows import gram
 CHUNK = 256  # segments that run side by side
 _BLOCK = 1 << 15  # numbers: slopes that are known at once
 _FEWEST = 8  # steps for which that pays
+_SHORT = 4096  # steps of all segments: a run takes milliseconds then, and to compile one a second
 
 
 class Segments(NamedTuple):
@@ -78,7 +79,10 @@ def build_segments(
     count = len(pieces)
     chunks = -(-count // (CHUNK * shares)) * shares
     width = -(-count // chunks)
-    width += -width % 8 if width > 8 else 0  # about as many segments run by the same program
+    if width > 8:  # about as many segments run by the same program
+        width += -width % 8
+    elif steps * width <= _SHORT:  # where others beside them cost nothing
+        width = max(2, 1 << (width - 1).bit_length())
     if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
         chunks, width = like.scored.shape[0], like.scored.shape[2]
     nothing = Segments(*(np.zeros_like(part) for part in pieces[0]))
@@ -266,7 +270,7 @@ def _flatten(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
     return jnp.moveaxis(part, 0, 1).reshape(n, steps * m)  # n = 0 of a motion without inputs
 
 
-@partial(jax.jit, static_argnames=("dynamics", "blocks"))
+@partial(quick_jit, static_argnames=("dynamics", "blocks"))
 def block_scores(
     dynamics: Dynamics,
     numbers: Numbers,

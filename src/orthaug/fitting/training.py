@@ -93,6 +93,8 @@ class Choice:
     """Whether runs that evidence silenced are made again with weaker regularizations, if held-out
     rows can choose.
     """
+    briefly: bool = False
+    """Whether the chosen run only has to simulate."""
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Return whether held-out errors choose between runs or regularizations.
@@ -139,7 +141,8 @@ def train(
         _run_all(task, starts, structure, solver, choice, progress, runner),
     )
     losses = [task.loss(run) for run in runs]
-    concluded = cache(lambda i: task.conclude(structure, task.learned(runs[i])))
+    briefly = choice.briefly
+    concluded = cache(lambda i: task.conclude(structure, task.learned(runs[i]), briefly=briefly))
     stopped = sum(run.ending is Ending.STOPPED for run in runs)
     untried = bool(
         stopped and choice.validation is None and choice.blocks and choice.compares(task, starts)
@@ -169,7 +172,7 @@ def train(
     shown = alike if choice.scored and held_out is None else list(range(len(starts)))
     members = [best]
     if best < 0:
-        estimate = _conclude_physics(task, structure)
+        estimate = _conclude_physics(task, structure, briefly=briefly)
     elif choice.ensemble:
         members = alike
         estimate = task.conclude(structure, _median(task, runs, members, best))
@@ -189,7 +192,7 @@ def train(
         *replacing,
         *retry_warnings(planned, starts, runs, held_out, best),
     )
-    beside = _physics_to_compare(task, structure) if best >= 0 else None
+    beside = _physics_to_compare(task, structure) if best >= 0 and not briefly else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
     return replace(estimate, **found, warnings=warnings)
 
@@ -383,11 +386,11 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     )
     try:
         own = task.on(training).prepare(solver, structure)
-        fits = [_conclude_physics(own, structure)]
+        fits = [_conclude_physics(own, structure, briefly=True)]
         for start in starts:
             report()
             run = own.run(solver, start.weights, structure, start.regularization)
-            fits.append(own.conclude(structure, own.learned(run)))
+            fits.append(own.conclude(structure, own.learned(run), briefly=True))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
@@ -419,9 +422,9 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _conclude_physics(task: Task, structure: Structure) -> Any:
+def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Any:
     rows, learned = task.physics_alone()
-    return replace(rows.conclude(structure, learned), criterion=task.criterion)
+    return replace(rows.conclude(structure, learned, briefly=briefly), criterion=task.criterion)
 
 
 def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.data.sources import Partition
 from orthaug.inference.measures import Measure, Points, Support, weigh
 from orthaug.models.dynamics import Numbers
@@ -490,7 +490,7 @@ def rest_of(
     ) / size
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def slopes_at(
     form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m r np"]:
@@ -528,7 +528,7 @@ def _sum_over(
     return total
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _square(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:
@@ -537,7 +537,7 @@ def _square(
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _gauss_newton(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:
@@ -555,7 +555,7 @@ def _gauss_newton(
     return gradient, jnp.einsum("m,mij,mik->jk", weight, slope, slope)
 
 
-@partial(jax.jit, static_argnames="form")
+@partial(quick_jit, static_argnames="form")
 def _second(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:

@@ -21,6 +21,8 @@ from orthaug.models.dynamics import Dynamics, Numbers
 LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 64, 16  # steps, and windows side by side
+# Steps of few windows: rows that are not gone through cost nothing, and a program one second
+_USUAL = 1024
 _SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
@@ -41,7 +43,8 @@ class Windows(NamedTuple):
         Few shapes have programs of their own.
         """
         steps, count = np.shape(self.scored)
-        more = padded_steps(steps) - steps, -count % _LANES
+        length = padded_steps(steps) if count > _LANES else max(padded_steps(steps), _USUAL)
+        more = length - steps, -count % _LANES
 
         def repeat_last(part: Any) -> Any:
             return np.pad(
