@@ -109,12 +109,7 @@ def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
             extra[k] = np.sign(v[k])
         elif column == "speed times its size":
             extra[k] = v[k] * abs(v[k])
-        pull = drive[k] - 3.0 * v[k] - 8.0 * x[k] - TRUTH * extra[k] - 0.5 * np.tanh(v[k] / 0.1)
-        for _ in range(5):
-            v_next = v[k] if _ == 0 else v_next
-            v_next = v_next + STEP / 5 * pull
-        v[k + 1] = v_next
-        x[k + 1] = x[k] + STEP * (v[k] + v[k + 1]) / 2
+        x[k + 1], v[k + 1] = _next_sample(x[k], v[k], drive[k] - TRUTH * extra[k])
     y = x + noise * x.std() * rng.normal(size=ROWS)
     names = ["drive", "extra"]
     signals = np.column_stack([drive, extra])
@@ -134,6 +129,23 @@ def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
     )
     fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(5,), inputs=("v",)), seed=seed)
     return _judged(fit, "e", fit.values[3], fit.interval, 3, fit.shared, ("v",))
+
+
+def _next_sample(x: float, v: float, held: float) -> np.ndarray:
+    """Place and speed a sample later, by small Runge-Kutta steps: the truth is not that of coarse ones."""
+
+    def rates(state: np.ndarray) -> np.ndarray:
+        x, v = state
+        return np.array([v, held - 3.0 * v - 8.0 * x - 0.5 * np.tanh(v / 0.1)])
+
+    state, h = np.array([x, v]), STEP / 5
+    for _ in range(5):
+        first = rates(state)
+        second = rates(state + h / 2 * first)
+        third = rates(state + h / 2 * second)
+        fourth = rates(state + h * third)
+        state = state + h / 6 * (first + 2 * second + 2 * third + fourth)
+    return state
 
 
 def _judged(

@@ -48,6 +48,7 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.physics.parameters import PhysicsMap
 
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
+_ALIKE = 1e-6  # of a bias
 _LISTED = 4  # parameters that a warning lists at most
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
 
@@ -380,8 +381,13 @@ def _candidates(
 
 
 def _owners(found: Sequence[Causes], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
-    """Return for each parameter the causes that move it most, and their share."""
-    return [(found[i].name, found[i].share) for i in np.argmax(np.abs(moved), axis=0)]
+    """Return for each parameter the causes that move it most, and their share.
+
+    Of causes that move it alike the first: a dead zone and a saturation differ by a damper.
+    """
+    size = np.abs(moved)
+    most = size >= (1 - _ALIKE) * size.max(axis=0)
+    return [(found[i].name, found[i].share) for i in np.argmax(most, axis=0)]
 
 
 def _physical_rows(

@@ -136,8 +136,8 @@ def explain_learner(
 
 def best_of(considered: Considered) -> SuspectedBias | None:
     """Return the plain term that explains most, or one of a family that explains clearly more."""
-    best = max(considered.plain, key=_share, default=None)
-    other = max((*considered.soft, *considered.families), key=_share, default=None)
+    best = max(considered.plain, key=_rank, default=None)
+    other = max((*considered.soft, *considered.families), key=_rank, default=None)
     if best is None or other is None:
         return best or other
     # A plain term gives way only where it explains clearly less: a family also fits a width
@@ -148,6 +148,11 @@ def best_of(considered: Considered) -> SuspectedBias | None:
 
 def _share(entry: SuspectedBias) -> float:
     return entry.share
+
+
+def _rank(entry: SuspectedBias) -> float:
+    """Return a share without its last digits: of two that say the same the first is named."""
+    return round(_share(entry), 6)
 
 
 def rivals_of(cause: SuspectedBias, table: Sequence[SuspectedBias]) -> list[SuspectedBias]:

@@ -25,6 +25,8 @@ from orthaug.selection.learned_linearization import LearnedLinearization
 
 _RANK = 1e-9  # of the largest singular value
 _ROUNDING = 1e-8  # of the largest variance
+# Of a share: a dead zone and a saturation span the same beside a damper, and the first is taken
+_DIGITS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,7 +392,9 @@ def _grow(space: Space, chosen: list[Candidate]) -> list[Candidate]:
     tie = max(space.tie, _PART * (1 - best))
     able = [i for i, share in enumerate(shares) if share >= best - tie]
     taken = min(
-        able, key=lambda i: (sum(one.complexity for one in trials[i]), -shares[i]), default=None
+        able,
+        key=lambda i: (sum(one.complexity for one in trials[i]), -round(shares[i], _DIGITS)),
+        default=None,
     )
     return [] if taken is None else _refine(space, trials[taken])
 
@@ -398,7 +402,7 @@ def _grow(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
     gains = space.gains([space.column(one) for one in chosen])
     found: dict[Any, Candidate] = {}
-    for i in np.argsort(-gains, kind="stable"):
+    for i in np.argsort(-np.round(gains, _DIGITS), kind="stable"):
         if len(found) == _TRIED or gains[i] <= 0:
             break
         found.setdefault(space.candidates[int(i)].identity, space.candidates[int(i)])
@@ -550,7 +554,11 @@ def rivals(
     gains = space.gains(others) + space.explained_share(others)
     near = gains >= space.explained_share(columns) - 2 * space.tie
     own = chosen[number]
-    found = [space.candidates[int(i)] for i in np.argsort(-gains) if near[int(i)]]
+    found = [
+        space.candidates[int(i)]
+        for i in np.argsort(-np.round(gains, _DIGITS), kind="stable")
+        if near[int(i)]
+    ]
     names = dict.fromkeys(one.name for one in found if one.identity != own.identity)
     return tuple(names)[:most]
 
@@ -558,7 +566,7 @@ def rivals(
 def single_terms(space: Space, most: int) -> list[tuple[Candidate, float]]:
     """Return the terms that explain most if each is the only one, the best width of each."""
     gains, found = space.gains([]), []
-    for i in np.argsort(-gains, kind="stable"):
+    for i in np.argsort(-np.round(gains, _DIGITS), kind="stable"):
         candidate = space.candidates[int(i)]
         if gains[i] > 0 and all(candidate.identity != other.identity for other, _ in found):
             found.append((candidate, float(min(gains[i], 1.0))))
