@@ -252,7 +252,8 @@ def test_the_plant_of_a_loop(beside_a_learner: Any, tmp_path: Path) -> None:
     )
     assert plant.state_names == ("angle", "rate") and plant.step_inputs == ("torque",)
     ran = plant.simulate(given).trajectories[0]
-    assert np.nanmax(np.abs(ran.errors)) < 0.01  # 0.6 s, over which it grows sixfold
+    # 0.6 s, over which an error grows sixfold: not more than the loop was fitted to
+    assert np.nanmax(np.abs(ran.errors)) < 4 * np.sqrt(beside_a_learner.status.loss)
     assert oa.numpy_step(beside_a_learner.model).step_inputs == ("torque",)
     program = oa.export(beside_a_learner.model, tmp_path / "code", "c")
     assert [signal.label for signal in program.inputs] == ["torque"]

@@ -119,6 +119,12 @@ class _Compiled:
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         return self if instance is None else functools.partial(self, instance)
 
+    def __reduce__(self) -> Any:
+        """Return what pickle keeps: the name in its module, as of a function."""
+        if "<locals>" in self._function.__qualname__:
+            return type(self), (self._function, self._effort, self._options)
+        return self._function.__qualname__
+
     @functools.cached_property
     def _plain(self) -> Callable[..., Any]:
         with self._lock:

@@ -384,8 +384,9 @@ def conclude_motion(
         plan: the segments that were trained on.
         learned: of these segments.
         alone: coordinates of physics alone; None where no run of it is finite.
-        briefly: leave out the split and the choice of a window to predict from, which no free run
-            depends on and which take longer than a short training.
+        briefly: leave out the choice of a window to predict from, on which no free run depends and
+            which takes longer than a short training. The split stays: beyond the data the physics
+            goes on as it is split, and the correction fades.
     """
     problem, begins = plan.problem, alone is not None
     assert learned.coefficients is not None and learned.errors is not None
@@ -427,7 +428,7 @@ def conclude_motion(
     )
     return (
         fit.split(structure.measure, getattr(structure, "shared", "auto"))
-        if learned.ending.usable and not briefly
+        if learned.ending.usable
         else fit
     )
 

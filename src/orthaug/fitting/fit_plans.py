@@ -81,7 +81,7 @@ class Request:
     checkpoints: Checkpoints | None = None
     noise: Noise = "white"
     briefly: bool = False
-    """Whether the model only has to simulate: its θ is not split, and it has no intervals."""
+    """Whether the model only has to simulate."""
 
     @property
     def warm(self) -> bool:
