@@ -132,12 +132,12 @@ def test_streamed_rows_train_to_the_same_model(structure, regularization, ny):
     memory, streamed = both(structure, regularization, ny)
     assert memory.status.ok and streamed.status.ok
     assert apart(streamed.theta, memory.theta) <= (1e-10 if structure.projects else 2e-9)
-    # A prior that is iterated ends where the loss settles: its square root is what predictions may differ by
-    assert apart(prediction(streamed), prediction(memory)) <= (
-        1e-7 if regularization == "evidence" else 2e-9
-    )
-    assert streamed.status.loss == pytest.approx(memory.status.loss, rel=1e-9)
-    assert streamed.status.iterations == memory.status.iterations
+    # A prior that is iterated ends where the weights settle; the loss alone is not at its minimum there
+    evidence = regularization == "evidence"
+    assert apart(prediction(streamed), prediction(memory)) <= (1e-7 if evidence else 2e-9)
+    expected = pytest.approx(memory.status.loss, rel=1e-7 if evidence else 1e-9)
+    assert streamed.status.loss == expected
+    assert abs(streamed.status.iterations - memory.status.iterations) <= evidence
 
 
 @pytest.mark.parametrize(("structure", "regularization", "ny"), CASES, ids=named)
