@@ -129,10 +129,8 @@ def motion(column: str, noise: float, seed: int) -> tuple[float, tuple[float, fl
     )
     fit = oa.estimate(record, physics, learner=oa.MLP(hidden=(5,), inputs=("v",)), seed=seed)
     value, held, warned = _judged(fit, "e", fit.values[3], fit.interval, 3, fit.shared, ("v",))
-    found = (
-        fit.diagnose()
-    )  # as the command: a fall-back to physics alone has doubts, which widen the intervals
-    row = found.parameters[3]
+    # As the command says it: a fall-back to physics alone has doubts, which widen the intervals
+    row = fit.diagnose().parameters[3]
     held = held if row.ci95 is None else tuple(row.ci95)
     return value, held, warned or row.ci95_counts == "noise only"
 

@@ -29,7 +29,7 @@ _FLAGS = (
     "xla_backend_optimization_level=0",
     "xla_cpu_parallel_codegen_split_count=1",
 )
-# The stored numbers of the golden tests are those of one set of instructions, which all machines have: with longer
+# The stored numbers of the golden tests are those of one set of instructions, which all x86 machines have: with longer
 # vectors sums are rounded otherwise, and what hangs on the rounding changes.
 if platform.machine() in ("x86_64", "AMD64"):
     _FLAGS = (*_FLAGS, "xla_cpu_max_isa=AVX2")
