@@ -15,6 +15,7 @@ from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
 from orthaug.analysis.verdict_text import describe_colour, small_effects
 from orthaug.data.expressions import parse_named
+from orthaug.fitting.conclusion import reopen_estimate
 from orthaug.fitting.field_points import field_under
 from orthaug.fitting.motion_estimate import fitted_numbers
 from orthaug.inference.splitting import nearest, shared_of_motion
@@ -675,3 +676,16 @@ def test_warm_starts_that_fit_no_motion_are_refused(fitted: oa.MotionEstimate) -
 def test_a_motion_that_would_take_too_much_is_refused_from_python() -> None:
     with pytest.raises(oa.InputError, match="training a learner of 10000600001 weights would take"):
         oa.estimate(data(), spring(learned=True), learner=oa.MLP((100_000, 100_000)))
+
+
+def test_a_model_of_segments_that_were_not_padded_is_split_as_ever() -> None:
+    """Earlier versions kept a single segment alone; it stands beside an empty one now."""
+    fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    kept = fit.model.trained
+    assert kept is not None and np.shape(kept.states)[-1] == 2
+    slope = None if kept.slope is None else np.asarray(kept.slope)[..., :1]
+    alone = kept._replace(states=np.asarray(kept.states)[..., :1], slope=slope)
+    again = reopen_estimate(replace(fit.model, trained=alone), data()).split(oa.Training())
+    np.testing.assert_allclose(again.theta, fit.theta, rtol=1e-12)
+    with pytest.raises(oa.InputError, match="trained on other rows"):
+        reopen_estimate(replace(fit.model, trained=alone._replace(rows=7)), data())
