@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from draws import seeds
 from machine import describe
 from scipy.special import erf
 
@@ -161,14 +162,19 @@ def rows(draws: int = 20, motion_draws: int = 3) -> Iterator[Row]:
         for name, delta in {**IN_CATALOGUE, **OUTSIDE}.items():
             fits = (
                 oa.estimate(record(delta, noise, i), BASELINE, learner=learner, seed=i)
-                for i in range(draws)
+                for i in seeds(draws, name, noise)
             )
             yield summed(name, noise, [judged(fit, ("a1", "a2"), TRUE) for fit in fits])
     for name, friction in MOTIONS.items():
-        made = (motion_record(friction, 0.01, i) for i in range(motion_draws))
         fits = (
-            oa.estimate(one, motion(), learner=oa.MLP((6,), inputs=("v",)), blocks=0, seed=i)
-            for i, one in enumerate(made)
+            oa.estimate(
+                motion_record(friction, 0.01, i),
+                motion(),
+                learner=oa.MLP((6,), inputs=("v",)),
+                blocks=0,
+                seed=i,
+            )
+            for i in seeds(motion_draws, "motion", name)
         )
         found = [judged(fit, ("c",), MOTION_TRUE[1:2]) for fit in fits if fit.interval is not None]
         if found:

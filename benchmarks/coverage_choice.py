@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from coverage_noise import noise_of
+from draws import seeds
 from machine import describe
 
 import orthaug as oa
@@ -77,7 +78,7 @@ def row(
 ) -> Row:
     """One line of the table; `select` are options of the choice, `NAIVE` for intervals as if nothing was chosen."""
     held, silent, width, weak, spurious, theta, shown, false = [], [], [], [], 0, [], [], []
-    for seed in range(draws):
+    for seed in seeds(draws, name, noise):
         data, truth = record(seed, noise=noise, **system)
         chosen = oa.select(data, PHYSICS, lags=LAGS, criterion=criterion, **select)
         made = (

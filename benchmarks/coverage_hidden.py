@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from draws import seeds
 from machine import describe
 
 import orthaug as oa
@@ -132,7 +133,7 @@ def row(system: str, noise: str, sees: str, draws: int) -> Row:
     make, hidden, physics, name, truth, v = SYSTEMS[system]
     held = silent = warned = named = 0
     widths = []
-    for seed in range(draws):
+    for seed in seeds(draws, system, noise, sees):
         with tempfile.TemporaryDirectory() as folder:
             place = Path(folder)
             table = np.column_stack(make(seed, noise, hidden))

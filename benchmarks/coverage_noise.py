@@ -15,6 +15,7 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
+from draws import seeds
 from machine import describe
 from scipy.signal import lfilter
 
@@ -167,7 +168,7 @@ def row(
 ) -> Row:
     """One line of the table. Parameters that a learner could imitate are left out: their truth is a split."""
     held, silent, width, shown, warned = [], [], [], [], []
-    for seed in range(draws):
+    for seed in seeds(draws, system, noise, sees):
         made, codes, _, limits = fit(record(seed), sees, seed)
         own = np.ones(len(truth), dtype=bool)
         if sees is not None and made.model.form.separates:

@@ -1,7 +1,7 @@
 """Coverage where a column of the physics is a function of what the learner sees, on the data if not by its name.
 
 Each row is a system, and what is asked is the parameter of that column: how often its interval holds the truth, how
-often it does not and nothing is said (a silent miss), and how wide it is. Run: python -m benchmarks.coverage_shared 10
+often it does not and nothing is said (a silent miss), and how wide it is. Run: python benchmarks/coverage_shared.py 10
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.signal
+from draws import seeds
 
 import orthaug as oa
 from orthaug.inference.nearly_shared import shared_warnings
@@ -171,7 +172,7 @@ def rows(draws: int = 10) -> list[Row]:
     for kind, run, column, noise in cases:
         held = warned = silent = 0
         widths = []
-        for seed in range(max(draws // (3 if kind == "motion" else 1), 3)):
+        for seed in seeds(max(draws // (3 if kind == "motion" else 1), 3), kind, column, noise):
             _, (low, high), said = run(column, noise, seed)
             holds = bool(low <= TRUTH <= high)
             held, warned = held + holds, warned + said

@@ -6,14 +6,18 @@ Five files have the systems: what a missing term moves (`coverage_causes`), colu
 sees; held, silent misses and the median width relative to the value. Allowed: silent misses of 5 %, with the standard
 error of so many draws.
 Run: python benchmarks/silent_misses.py [lagged draws, default 100] [draws of motions, default 30]; with few draws it
-tells of gross misses only.
+tells of gross misses only. Parts run in as many processes as there are cores.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import coverage_causes
@@ -45,53 +49,67 @@ class Row(NamedTuple):
         return ALLOWED + 200 * float(np.sqrt(ALLOWED / 100 * (1 - ALLOWED / 100) / self.draws))
 
 
-def rows(lagged: int = 100, motions: int = 30) -> Iterator[Row]:
-    """Yield every line as it is measured."""
+def _noise(lagged: int, _: int) -> Iterator[Row]:
     for one in coverage_noise.lagged_rows(lagged):
         yield Row(one.system, one.noise, one.learner, one.draws, one.held, one.silent, one.width)
+
+
+def _motion_noise(_: int, motions: int) -> Iterator[Row]:
     for one in coverage_noise.motion_rows(motions):
-        yield Row(
-            f"motion, {one.system}",
-            one.noise,
-            one.learner,
-            one.draws,
-            one.held,
-            one.silent,
-            one.width,
-        )
+        system = f"motion, {one.system}"
+        yield Row(system, one.noise, one.learner, one.draws, one.held, one.silent, one.width)
+
+
+def _choice(lagged: int, motions: int) -> Iterator[Row]:
     for one in coverage_choice.rows(lagged, motions):
-        yield Row(
-            f"chosen terms, {one.system}",
-            one.noise,
-            one.sees,
-            one.draws,
-            one.held,
-            one.silent,
-            one.width,
-        )
+        system = f"chosen terms, {one.system}"
+        yield Row(system, one.noise, one.sees, one.draws, one.held, one.silent, one.width)
+
+
+def _causes(lagged: int, motions: int) -> Iterator[Row]:
     for one in coverage_causes.rows(lagged, motions):
-        yield Row(
-            one.system, f"{one.noise:g}", one.sees, one.draws, one.held, one.silent, 100 * one.width
-        )
+        noise, width = f"{one.noise:g}", 100 * one.width
+        yield Row(one.system, noise, one.sees, one.draws, one.held, one.silent, width)
+
+
+def _shared(lagged: int, _: int) -> Iterator[Row]:
     for one in coverage_shared.rows(lagged):
         share = 100 / one.draws
-        width = 100 * one.width
-        yield Row(
-            one.system, one.noise, one.sees, one.draws, share * one.held, share * one.silent, width
+        held, silent, width = share * one.held, share * one.silent, 100 * one.width
+        yield Row(one.system, one.noise, one.sees, one.draws, held, silent, width)
+
+
+def _hidden(lagged: int, motions: int, words: str) -> Iterator[Row]:
+    for one in coverage_hidden.rows(lagged if words == "lagged" else motions, words):
+        share, value = 100 / one.draws, coverage_hidden.SYSTEMS[one.system][4]
+        held, silent, width = share * one.held, share * one.silent, 100 * one.width / value
+        yield Row(one.system, one.noise, one.sees, one.draws, held, silent, width)
+
+
+PARTS: dict[str, Callable[[int, int], Iterator[Row]]] = {
+    "causes": _causes,
+    "motions with a hidden state": partial(_hidden, words="motion"),
+    "choice": _choice,
+    "noise of motions": _motion_noise,
+    "shared columns": _shared,
+    "hidden states": partial(_hidden, words="lagged"),
+    "noise": _noise,
+}
+
+
+def measure(part: str, lagged: int, motions: int) -> list[Row]:
+    """Return the lines of a part, and print each as it is measured."""
+    found = []
+    for row in PARTS[part](lagged, motions):
+        figures = (f"{row.held:.0f} %", f"{row.silent:.0f} %", f"{row.width:.2g} %")
+        shown = ["" if figure.startswith("nan") else figure for figure in figures]
+        print(
+            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |",
+            flush=True,
         )
-    for words, draws in (("lagged", lagged), ("motion", motions)):
-        for one in coverage_hidden.rows(draws, words):
-            share, value = 100 / one.draws, coverage_hidden.SYSTEMS[one.system][4]
-            width = 100 * one.width / value
-            yield Row(
-                one.system,
-                one.noise,
-                one.sees,
-                one.draws,
-                share * one.held,
-                share * one.silent,
-                width,
-            )
+        found.append(row)
+        jax.clear_caches()  # a process may map memory 65,530 times, and each program takes some
+    return found
 
 
 def main(lagged: int, motions: int) -> int:
@@ -101,16 +119,11 @@ def main(lagged: int, motions: int) -> int:
         + 7 * "|---"
         + "|"
     )
-    began, missed = time.perf_counter(), []
-    for row in rows(lagged, motions):
-        figures = (f"{row.held:.0f} %", f"{row.silent:.0f} %", f"{row.width:.2g} %")
-        shown = ["" if figure.startswith("nan") else figure for figure in figures]
-        print(
-            f"| {row.system} | {row.noise} | {row.sees} | {row.draws} | {' | '.join(shown)} |",
-            flush=True,
-        )
-        missed += [row] if row.silent > row.most else []
-        jax.clear_caches()  # a process may map memory 65,530 times, and each program takes some
+    began = time.perf_counter()
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(os.cpu_count(), spawned, max_tasks_per_child=1) as processes:
+        parts = [processes.submit(measure, part, lagged, motions) for part in PARTS]
+        missed = [row for part in parts for row in part.result() if row.silent > row.most]
     minutes = (time.perf_counter() - began) / 60
     print(f"\n{minutes:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}")
     for row in missed:
