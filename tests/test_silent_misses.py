@@ -13,6 +13,7 @@ SYSTEMS = {
     "noise of uneven size": ("coverage_noise", "300 rows", "uneven"),
     "smooth friction": ("coverage_causes", "-.15 tanh(v/.3)", 0.02),
     "friction that no catalogue has": ("coverage_causes", "-.4 v/(1+v²)", 0.02),
+    "friction of two laws": ("coverage_causes", "Stribeck, v²", 0.02),
 }
 
 

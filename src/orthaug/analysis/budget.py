@@ -370,6 +370,7 @@ def _candidates(
                 entry.share,
                 entry.shift + bias - causes.moved,
                 entry.suspect in declared,
+                "sign(" in entry.suspect.expression,
             )
             for entry in causes.comparable
             if entry.explained

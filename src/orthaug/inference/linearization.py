@@ -29,7 +29,7 @@ SMALLEST_COSINE = 1e-6
 VIOLATION = 1e-9
 WORKING_SET = 1000  # rows of the first linear program, and the most that are added at a time
 MOST_ROUNDS = 50
-IN_SPAN = 1e-10  # ‖rest‖/‖Δ‖ below which Δ counts as physics
+IN_SPAN = 1e-8  # ‖rest‖/‖Δ‖ below which Δ counts as physics: rounding of nearly dependent columns
 
 Removability = Literal["unremovable", "removable", "undecided", "orthogonal"]
 
