@@ -44,3 +44,13 @@ def test_silent_misses_are_few(name, record_property, monkeypatch):
         <= silent_misses.Row(system, str(noise), "", DRAWS, row.held, row.silent, row.width).most
     )
     assert row.held > 0
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("seed", [5, 6])
+def test_folds_that_evidence_silences_do_not_cost_the_learner(seed):
+    """On two or three of four folds evidence leaves nothing of the learner; on all rows it finds the friction."""
+    coverage_shared = import_module("coverage_shared")
+    value, (low, high), _ = coverage_shared.motion("independent noise", 0.01, seed)
+    assert low < coverage_shared.TRUTH < high
+    assert high - low < 0.2 and abs(value - coverage_shared.TRUTH) < 0.05

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -155,8 +155,8 @@ class HeldOutErrors:
     where: str
     labels: tuple[str, ...]
     """What each piece belongs to: a block, or a part."""
-    alone: Pieces
-    runs: tuple[Pieces, ...]
+    alone: Pieces = field(repr=False)  # an error for every row: thousands of lines on a screen
+    runs: tuple[Pieces, ...] = field(repr=False)
     chosen: int = 0
 
     @property

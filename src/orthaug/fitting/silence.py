@@ -55,9 +55,30 @@ def add_retries(
     if not usable:
         return starts, runs
     lowest = min(usable, key=lambda end: end.end.point.loss)
-    ridge = float(f"{evidence_ridge(lowest.objective, lowest.end.point, lowest.effective):.3g}")
-    more, others = make([start._replace(regularization=ridge) for start in starts])
+    more, others = make([start._replace(regularization=found_ridge(lowest)) for start in starts])
     return starts + free + more, runs + ends + others
+
+
+def found_ridge(run: Any) -> float:
+    """Return the ridge that evidence finds where a run ended, to three digits."""
+    return float(f"{evidence_ridge(run.objective, run.end.point, run.effective):.3g}")
+
+
+def fold_ridges(starts: Sequence[Any], runs: Sequence[Any], outputs: int) -> list[float | None]:
+    """Return for each run the ridge with which a fold makes it again where evidence silences it.
+
+    Evidence may silence the learner on three of four folds and not on all rows. Such folds say
+    nothing on the learner; the ridge of all rows takes their place. None where all rows have none.
+    """
+    return [
+        found_ridge(run)
+        if start.regularization == "evidence"
+        and run.ending.usable
+        and run.ending is not Ending.STOPPED
+        and not is_silenced(run.effective, outputs)
+        else None
+        for start, run in zip(starts, runs, strict=True)
+    ]
 
 
 def retry_warnings(

@@ -29,7 +29,7 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.setup import FOLD_ITERATIONS
-from orthaug.fitting.silence import add_retries, retry_warnings
+from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
@@ -149,7 +149,7 @@ def train(
     )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
-    held_out = _held_out(task, starts, concluded, structure, solver, choice, runner)
+    held_out = _held_out(task, starts, runs, concluded, structure, solver, choice, runner)
     errors = (
         [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
     )
@@ -332,6 +332,7 @@ def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
 def _held_out(
     task: Task,
     starts: Sequence[PlannedRun],
+    runs: Sequence[Any],
     concluded: Callable[[int], Any],
     structure: Structure,
     solver: Solver,
@@ -360,7 +361,8 @@ def _held_out(
         )
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
-    given = (task, starts, structure, solver)
+    ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
+    given = (task, list(zip(starts, ridges, strict=True)), structure, solver)
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(
@@ -387,9 +389,11 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     try:
         own = task.on(training).prepare(solver, structure)
         fits = [_conclude_physics(own, structure, briefly=True)]
-        for start in starts:
+        for start, ridge in starts:
             report()
             run = own.run(solver, start.weights, structure, start.regularization)
+            if ridge is not None and is_silenced(run.effective, task.bound.ny):
+                run = own.run(solver, start.weights, structure, ridge)
             fits.append(own.conclude(structure, own.learned(run), briefly=True))
     except InputError:  # the block took away what the physics needs
         return [failed] * (1 + len(starts))
