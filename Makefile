@@ -21,11 +21,11 @@ setup: $(STAMP)  ## make the environment .venv (the others do it when it is need
 demo: $(STAMP)  ## fit the built-in mass-spring-damper example
 	@$(BIN)/orthaug demo
 
-test: $(STAMP)  ## run the whole test suite, a file at a time on every core
+test: $(STAMP)  ## run the test suite but for what takes long, a file at a time on every core
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-proofs: $(STAMP)  ## run the slow proofs, which the suite leaves out, and print what they measured
-	@$(BIN)/python -m pytest -q -m proof -n auto --dist loadfile --no-loadscope-reorder
+proofs: $(STAMP)  ## run the slow tests and proofs, which the suite leaves out, and print what these measured
+	@$(BIN)/python -m pytest -q -m "proof or slow" -n auto --dist loadfile --no-loadscope-reorder
 
 fuzz: $(STAMP)  ## run 3,000 seeded hostile trials and print how many held, by area
 	@$(BIN)/python benchmarks/fuzz.py

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import slow
 from hypothesis import HealthCheck, settings
 
 # What several files compile is compiled once: the workers share their programs, as the command line does between runs.
@@ -70,8 +71,14 @@ golden golden_motion golden_examples app documents engines motion_fit report_bro
 """
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first, the others as they come."""
+    """The longest files first, the others as they come; what takes long is marked."""
+    long = slow.listed()
+    for item in items:
+        fixtures = {(item.path.stem, name) for name in getattr(item, "fixturenames", ())}
+        if item.nodeid in long or fixtures & slow.FIXTURES:
+            item.add_marker("slow")
     place = {f"test_{name}": i for i, name in enumerate(_LONGEST.split())}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
