@@ -6,8 +6,9 @@ of the catalogue has; so a cause may be the true one where
 
     1 − s ≤ 12 (1 − s_best + ν),    and s at least 0.8 of s_best.
 
-Where the best cause jumps, 1 − s_best + ν counts as 0.0035 at least: a network rounds a jump, and
-by chance it does so as a wrong cause would, closer than the noise lets the true one come.
+Two laws that jump may act together, as Coulomb's and Stribeck's do, and a network rounds a jump:
+by chance it does so as one law alone would, and closer than the true mixture comes. So mixtures of
+the best with others count that leave 7 (1 − s_best + ν) of it.
 Terms that are nearly the physics itself, `|v|^1.1`, fit anything with a huge size and stay out.
 Every such cause has an interval about the estimate less its bias, as wide as noise and what it
 leaves. What is shown is the hull of them; where that is wider than the value itself, the data do
@@ -29,13 +30,11 @@ from orthaug.inference.covariance import interval, reach
 
 # Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
 _AS_CLOSE = 12.0
-# Friction of Coulomb and Stribeck, 500 rows at 2 % noise: without it the hull missed the truth in
-# 16 % of the draws of two such forms together and in 8 % of a jump, with 0.002 in 12 and 8, with
-# this in none (benchmarks/coverage_causes.py)
-_ROUNDED = 0.0035
+# Of friction by Coulomb's and Stribeck's laws together, 500 rows at 2 % noise
+_MIXED = 7.0
 # Cosine with the physics: beyond it a term is six times larger than what the learner shows of it
 MOST_PHYSICS = 0.986
-_LEAST = 0.8  # of the best share: what explains less is no likely cause
+LEAST = 0.8  # of the best share: what explains less is no likely cause
 _LISTED = 4  # parameters that a warning lists at most
 
 
@@ -47,7 +46,6 @@ class Candidate:
     share: float
     moved: Vector
     declared: bool = False
-    jumps: bool = False
 
     @property
     def unsure(self) -> Vector:
@@ -81,11 +79,15 @@ def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]
     likely = [c for c in candidates if c.share > 0]
     if not likely:
         return []
-    best = max(likely, key=lambda c: c.share)
-    left = max(1 - best.share + noise, _ROUNDED if best.jumps else 0.0)
-    left = min(_AS_CLOSE * left, 1 - _LEAST * best.share)
+    best = max(c.share for c in likely)
+    left = min(_AS_CLOSE * (1 - best + noise), 1 - LEAST * best)
     kept = [c for c in likely if 1 - c.share <= left]
     return [c for c in kept if c.declared] or kept
+
+
+def most_mixed(best: float, noise: float) -> float:
+    """Return the share of the learner that a mixture of causes may leave, by that of the best."""
+    return min(_MIXED * (1 - best + noise), 1 - LEAST * best)
 
 
 def hull(

@@ -22,12 +22,14 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plain_number
 from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
 from orthaug.analysis.bias_hull import (
+    LEAST,
     MOST_PHYSICS,
     Candidate,
     NamedCause,
     compatible,
     hull,
     is_determined,
+    most_mixed,
     undetermined_warning,
 )
 from orthaug.analysis.causes import (
@@ -40,7 +42,12 @@ from orthaug.analysis.causes import (
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.mapped_bias import physical_with_bias
 from orthaug.analysis.measure_bias import linearization_of
-from orthaug.analysis.suspects import MotionSuspect, Suspect, check_motion_suspects
+from orthaug.analysis.suspects import (
+    ODD_JUMPS,
+    MotionSuspect,
+    Suspect,
+    check_motion_suspects,
+)
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
@@ -370,15 +377,64 @@ def _candidates(
                 entry.share,
                 entry.shift + bias - causes.moved,
                 entry.suspect in declared,
-                "sign(" in entry.suspect.expression,
             )
             for entry in causes.comparable
             if entry.explained
             and (entry.suspect in declared or (entry.physics_cosine or 0.0) <= MOST_PHYSICS)
         ]
         if likely:
-            kept += compatible(likely, terms_of(causes, terms).noise_share())
+            of = terms_of(causes, terms)
+            close = compatible(likely, of.noise_share())
+            kept += close
+            if not any(c.declared for c in close):
+                kept += _mixtures(of, causes, bias - causes.moved)
     return kept
+
+
+def _mixtures(terms: BudgetTerms, causes: Causes, others: Vector) -> list[Candidate]:
+    """Return the best cause with as much of each other one as noise may hide, where both jump.
+
+    Of `(1 − t) f_best + t f_other`, each of the size that explains most of the learner alone, the
+    largest t at which the two together leave no more than `most_mixed` of it.
+
+    Args:
+        others: the bias by causes of other outputs.
+    """
+    table = [
+        entry
+        for entry in causes.comparable
+        if entry.explained
+        and (entry.physics_cosine or 0.0) <= MOST_PHYSICS
+        and entry.suspect.name.startswith(ODD_JUMPS)
+    ]
+    best = max(table, key=lambda entry: entry.share, default=None)
+    if best is None or best.share < max(entry.share for entry in causes.comparable):
+        return []
+    beside = [one for one in table if one is not best and one.share >= LEAST * best.share]
+    linearization = terms.linearization
+    responses = terms.respond([entry.suspect for entry in (best, *beside)], run=False)
+    own = linearization.unshared_learner
+    if responses is None or own is None or any(one.held is None for one in responses):
+        return []
+    whole = float(np.vdot(own, own))
+    left = [
+        own - entry.coefficient * linearization.residual(np.asarray(response.held))
+        for entry, response in zip((best, *beside), responses, strict=True)
+    ]
+    most = most_mixed(best.share, terms.noise_share()) * whole
+    found = []
+    for entry, rest in zip(beside, left[1:], strict=True):
+        apart = rest - left[0]
+        a, b = float(np.vdot(apart, apart)), float(np.vdot(apart, left[0]))
+        c = float(np.vdot(left[0], left[0])) - most
+        if not a > 0 or c >= 0:
+            continue
+        t = min((np.sqrt(b * b - a * c) - b) / a, 1.0)
+        share = 1 - (c + most + t * (2 * b + t * a)) / whole
+        name = f"{best.suspect.name} and {entry.suspect.name}"
+        moved = (1 - t) * best.shift + t * entry.shift
+        found.append(Candidate(name, share, moved + others))
+    return found
 
 
 def _owners(found: Sequence[Causes], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
