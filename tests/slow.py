@@ -14,7 +14,7 @@ from pathlib import Path
 
 LIST = Path(__file__).with_name("slow.txt")
 LONG = 4.0  # s of its own, with one worker more than cores
-# Fixtures of a module that take longer than a quarter of a minute, and what is asked of them is shown in little elsewhere
+# Fixtures of a module that take longer than a quarter of a minute: each test that uses one is slow
 FIXTURES = {
     ("test_learner_states", "fit"),
     ("test_motion_without_inputs", "fitted"),
