@@ -400,15 +400,14 @@ def _mixtures(terms: BudgetTerms, causes: Causes, others: Vector) -> list[Candid
     Args:
         others: the bias by causes of other outputs.
     """
-    table = [
+    likely = [
         entry
         for entry in causes.comparable
-        if entry.explained
-        and (entry.physics_cosine or 0.0) <= MOST_PHYSICS
-        and entry.suspect.name.startswith(ODD_JUMPS)
+        if entry.explained and (entry.physics_cosine or 0.0) <= MOST_PHYSICS
     ]
+    table = [entry for entry in likely if entry.suspect.name.startswith(ODD_JUMPS)]
     best = max(table, key=lambda entry: entry.share, default=None)
-    if best is None or best.share < max(entry.share for entry in causes.comparable):
+    if best is None or best.share < max(entry.share for entry in likely):
         return []
     beside = [one for one in table if one is not best and one.share >= LEAST * best.share]
     linearization = terms.linearization
