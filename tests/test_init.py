@@ -136,11 +136,6 @@ def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
 
 
 REFUSED = [
-    (
-        (),
-        "the names of the columns do not show which are inputs and which outputs: force [N], position_mm. Give "
-        "both",
-    ),
     (("--inputs", "force"), "Give both"),
     (
         ("--inputs", "force", "--outputs", "speed"),
@@ -668,6 +663,79 @@ def test_a_second_time_is_no_signal_either(tmp_path):
         "0.02 s, from column 'time'" in done.out and "left out: n (counts the rows)" in done.out
     ), done.err
     assert "left out: aika (rises by 0.02 in each row, as a time does)" in done.out
+
+
+def write_columns(path, **columns):
+    pd.DataFrame({"t": 0.01 * np.arange(len(next(iter(columns.values())))), **columns}).to_csv(
+        path, index=False
+    )
+    return path
+
+
+def test_what_follows_from_the_past_of_others_is_an_output(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    rng = np.random.default_rng(8)
+    u, y = plant()
+    w = np.repeat(rng.normal(size=60), 10)
+    z = y + scipy.signal.lfilter([0, 0.3], [1, -0.9], w)
+    file = write_columns(tmp_path / "a.csv", level=z, valve=u, wind=w, other=rng.normal(size=600))
+    done = run("init", file, "--out", tmp_path / "a.toml")
+    assert done.code == 0
+    assert (
+        "past values of 'valve' and 'wind' help to predict 'level', but not the reverse" in done.out
+    )
+    assert "left out: other" in done.out
+    spec = (tmp_path / "a.toml").read_text()
+    assert 'inputs = ["valve", "wind"]' in spec and 'outputs = ["level"]' in spec
+    assert "# Inputs and outputs are guessed" in spec
+
+
+def in_a_loop(rng) -> dict[str, np.ndarray]:
+    """A first-order plant under proportional control, with noise in both places."""
+    u, y = np.zeros(600), np.zeros(600)
+    for k in range(1, 600):
+        y[k] = 0.9 * y[k - 1] + 0.5 * u[k - 1] + 0.1 * rng.normal()
+        u[k] = -0.8 * y[k - 1] + 0.1 * rng.normal()
+    return {"drive": u, "speed": y}
+
+
+def side_by_side(rng) -> dict[str, np.ndarray]:
+    """Two runs of one plant, four columns."""
+    columns = {}
+    for name in ("first", "second"):
+        u = rng.normal(size=600)
+        columns |= {
+            f"{name}_drive": u,
+            f"{name}_speed": scipy.signal.lfilter([0, 1], [1, -0.8], u)
+            + 0.01 * rng.normal(size=600),
+        }
+    return columns
+
+
+def unrelated(rng) -> dict[str, np.ndarray]:
+    return {"left": rng.normal(size=600), "right": rng.normal(size=600)}
+
+
+@pytest.mark.parametrize("columns", [in_a_loop, side_by_side, unrelated])
+def test_roles_that_the_data_leave_open_are_asked_for(tmp_path, monkeypatch, columns):
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    file = write_columns(tmp_path / "a.csv", **columns(np.random.default_rng(5)))
+    done = run("init", file, "--out", tmp_path / "a.toml")
+    assert done.code == 2 and not (tmp_path / "a.toml").exists()
+    assert "the names of the columns do not show which are inputs and which outputs" in done.err
+
+
+def test_an_integrator_gets_the_orders_of_runs_that_start_again(tmp_path, monkeypatch):
+    """Noise of the process: over a long run every linear model drifts away from the output."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.normal(size=120), 10)
+    speed = scipy.signal.lfilter([0, 0.02], [1, -0.98], u + rng.normal(size=1200))
+    y = np.cumsum(speed) + 1e-3 * rng.normal(size=1200)
+    file = write_columns(tmp_path / "a.csv", u=u, y=y)
+    done = run("init", file, "--out", tmp_path / "a.toml")
+    assert done.code == 0 and "orders are those of the best runs that start again" in done.out
+    assert "y[k-2]" in (tmp_path / "a.toml").read_text()
 
 
 def test_a_ramp_may_be_an_input_where_the_time_is_known(tmp_path, monkeypatch):

@@ -85,6 +85,11 @@ def _unexplained_text(test: StructureTest | None, judged: bool) -> str:
     if test is None or not test.found:
         what = "the residual contains more than noise"
         what += " (its verdict is `unmodelled`)" if judged else ""
+    elif test.is_far:
+        what = (
+            f"the free run errs by {percent(test.off)} of the output's deviation, and more than "
+            "noise: it is too far from the data to say what is missing"
+        )
     else:
         best = max(
             (one for one in (test.static, test.memory) if one is not None),

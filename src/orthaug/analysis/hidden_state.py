@@ -45,6 +45,8 @@ _MOST_USED = 0.9  # of the rows, by columns
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
+# Error of the run over the outputs' deviation, from which on the run's states are not the system's
+_FAR = 0.5
 # Steps, shorter ones, and the fall of the squares that ends them
 _SETTLING, _HALVINGS, _SETTLED = (8, 4, 0.01)
 
@@ -100,6 +102,13 @@ class StructureTest:
     """All with memory, the largest share first."""
     step: float = 0.0
     """Sampling time of the model."""
+    off: float = 0.0
+    """Error of the free run over the outputs' deviation, the largest of all outputs."""
+
+    @property
+    def is_far(self) -> bool:
+        """True if the run is too far from the data to say what its error is a function of."""
+        return self.off > _FAR
 
     @property
     def found(self) -> bool:
@@ -118,9 +127,10 @@ class StructureTest:
 
         Play and hysteresis of a position follow the sign of its speed, so they replace
         friction that is not quite right; a lag of a sample or two is a lag that the physics has too
-        few of.
+        few of. A run far from the data has other states than the system: a function of these would
+        pass for memory.
         """
-        if self.hidden is None or self.memory is None:
+        if self.hidden is None or self.memory is None or self.is_far:
             return False
         if self.is_a_lag(self.hidden) or self.is_a_lag(self.memory):
             return False
@@ -140,30 +150,31 @@ def structure_test(model: Model, record: Record) -> StructureTest | None:
 
     None where the run leaves all bounds or has no slopes, or there are too few rows.
     """
-    settled = _fit_physics(model, record)
-    if settled is None:
+    fitted = linear_runs(model, record, _MOST_ROWS, np.asarray(model.numbers.theta, dtype=float))
+    if fitted is None:
         return None
-    theta, runs = settled
+    error = np.sqrt(np.mean(np.concatenate([run.error for run in fitted]) ** 2, axis=0))
+    off = float((error / model.deviation).max())
+    theta, runs = _fit_physics(model, record, fitted)
     whole = np.concatenate([run.error for run in runs])
     if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
         return None
     moved = theta - np.asarray(model.numbers.theta)
     found = _test_families(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
-    return None if found is None else replace(found, step=float(model.sampling_time))
+    return None if found is None else replace(found, step=float(model.sampling_time), off=off)
 
 
-def _fit_physics(model: Model, record: Record) -> tuple[Vector, list[LinearRun]] | None:
+def _fit_physics(
+    model: Model, record: Record, runs: list[LinearRun]
+) -> tuple[Vector, list[LinearRun]]:
     """Return parameters of the physics with the least filtered free-run errors, and the runs.
 
-    They are found by Gauss-Newton steps.
+    They are found by Gauss-Newton steps from the model's own `runs`.
 
     Noise on the sensor, or coloured noise, biases what was fitted one step ahead: its run is then
     far from the data even though nothing is missing.
     """
     theta = np.asarray(model.numbers.theta, dtype=float)
-    runs = linear_runs(model, record, _MOST_ROWS, theta)
-    if runs is None:
-        return None
     for _ in range(_SETTLING):
         base = _base_columns(model, runs)
         pieces, colours = _colour_rows(runs, base)

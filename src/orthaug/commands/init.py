@@ -32,6 +32,7 @@ from orthaug.selection.first_orders import (
     first_model,
     free_run_errors,
 )
+from orthaug.selection.roles import guess_roles
 
 FILLED = 3
 """Rows of a gap that the spec's step `fill` reconstructs at most."""
@@ -40,11 +41,15 @@ _CLEARLY = "first significant at lag {}; from here on it runs clearly better on 
 
 @dataclass(frozen=True, eq=False)
 class Roles:
-    """The columns that are inputs and outputs, and the sampling time [s] that the user gave."""
+    """The columns that are inputs and outputs, and the sampling time [s] that the user gave.
+
+    `reason` is a sentence on what they were guessed from, "" where names or the user say it.
+    """
 
     inputs: tuple[Column, ...]
     outputs: tuple[Column, ...]
     sampling_time: float | None = None
+    reason: str = ""
 
 
 def channel_names(columns: Sequence[Column]) -> list[str]:
@@ -115,6 +120,8 @@ def spec_text(
     document.add(
         tomlkit.comment("Every key: orthaug schema keys. This is a first draft to be improved.")
     )
+    if roles.reason:
+        document.add(tomlkit.comment("Inputs and outputs are guessed by what predicts what."))
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
     if motion is None:
@@ -263,14 +270,19 @@ def assign(
 ) -> Roles | None:
     """Return the columns by name; where none are given, by the meaning of their names.
 
-    None where the names leave that open.
+    Where the names leave that open, by what predicts what in the data; None if that is open, too.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
     """
     if inputs is None and outputs is None:
         known = found.roles()
-        return None if known is None else Roles(tuple(known[0]), tuple(known[1]), sampling_time)
+        if known is not None:
+            return Roles(tuple(known[0]), tuple(known[1]), sampling_time)
+        guess = None if found.contradicted else guess_roles(found.signals)
+        if guess is None:
+            return None
+        return Roles(guess.inputs, guess.outputs, sampling_time, str(guess))
     named = {"input": inputs, "output": outputs}
     chosen = [
         None if n is None else columns_of(found, n, kind, sampling_time)
@@ -536,6 +548,7 @@ def _account(
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     doubtful = [one for one in found.clock.refused if one.signal or id(one.column) in used]
+    lines += [roles.reason] if roles.reason else []
     lines[2:2] = [f"not the time: column '{one.column.header}' {one.reason}" for one in doubtful]
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
@@ -570,6 +583,13 @@ def _account(
         f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
         f"deviation on {where}"
     )
+    if model.restarted is not None:
+        shown = ", ".join(percent(error, 3) for error in model.free_run)
+        lines.append(
+            "no linear model follows the outputs over all held-out rows; orders are those of the "
+            f"best runs that start again from measured lags every {model.restarted} rows, with an "
+            f"error of {shown}"
+        )
     if cut - missing > LOOKED_AT:
         lines.append(
             f"delays and orders are estimated from {LOOKED_AT} of these rows, in windows "

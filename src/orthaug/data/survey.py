@@ -108,15 +108,21 @@ class Survey:
             )
         return column
 
+    @property
+    def contradicted(self) -> bool:
+        """True if a column's name says one thing and its values another."""
+        clock = self.clock
+        return any(one.column.kind for one in clock.refused if not one.signal) or bool(
+            clock.column is not None and clock.column.kind and not clock.by_name
+        )
+
     def roles(self) -> tuple[list[Column], list[Column]] | None:
         """Return inputs and outputs, or None where a signal's name does not show its role.
 
         There must also be an output.
         """
         kinds = [c.kind for c in self.signals]
-        if any(one.column.kind for one in self.clock.refused if not one.signal):
-            return None  # a name says one thing and the values another
-        if self.clock.column is not None and self.clock.column.kind and not self.clock.by_name:
+        if self.contradicted:
             return None
         if "output" not in kinds or "" in kinds or not self.same_lengths(self.signals):
             return None

@@ -35,6 +35,7 @@ from orthaug.physics.streamed import StreamedProblem
 
 LEVEL = 0.03  # of the test; benchmarks/coverage_noise.py has its false alarms
 _WORTH = 0.5  # standard errors of θ: by less, coverage falls from 95 to 92 % at most
+_LISTED = 3  # parameters in a warning, at most
 _ORDERS = (1, 4)  # of the autoregressions that are tried
 _FEWEST = 100  # rows
 _STEPS, _CLOSE = 30, 1e-6  # of the iteration, and the relative fall of the squares at which it ends
@@ -77,23 +78,25 @@ class Inconsistency:
         each = [
             f"{self.names[i]} is {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
             f"instead of {self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
-            for i in self.moved
+            for i in self.moved[:_LISTED]
         ]
+        more = len(self.moved) - _LISTED
+        others = f"; {more} more are off by less" if more > 0 else ""
         text = (
             "the one-step θ is inconsistent: its coloured errors are correlated with the "
             "lagged outputs, and more rows do not reduce the bias. With a noise model "
-            f"(autoregression of order {self.order}) {'; '.join(each)}."
+            f"(autoregression of order {self.order}) {'; '.join(each)}{others}."
         )
         if self.instruments is not None and self.instruments_std is not None:
             given = [
                 f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})"
-                for i in self.moved
+                for i in self.moved[:_LISTED]
             ]
             text += (
                 f" Instrumental variables (the outputs of the free run) give {', '.join(given)}."
             )
         text += (
-            " No interval of the one-step θ covers this bias. Train on the free run "
+            " The intervals of the one-step θ do not include this bias. Train on the free run "
             '(focus = "simulation"), which does not have it, or with a noise model ([noise] '
             'model = "auto").'
         )

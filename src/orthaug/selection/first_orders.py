@@ -7,8 +7,10 @@ the measured ones, with all rows filtered by 1/A of the model before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 
@@ -31,6 +33,12 @@ _EXCITED = 1e-6  # singular value over the largest
 _DELAY = 20  # the largest delay that is looked for
 _SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
+_TELLING = 0.7  # error over the output's deviation, from which on a free run ranks no orders
+_RESTARTED = (300, 100, 30, 10)  # rows after which a run is started again where longer ones do not
+_DYNAMIC = 0.25  # of the error without past outputs, below which runs with them are believed
+
+_Choice: TypeAlias = tuple[float, Orders, tuple[float, ...]]
+"""The least error of all orders, the smallest orders near it, and their error of each output."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +56,18 @@ class FirstModel:
     free_run: tuple[float, ...]
     """Error of the free run on rows held out over the output's standard deviation, for each output.
     """
+    restarted: int | None = None
+    """Rows after which those runs start again from measured lags; None for one long run."""
 
 
 def first_model(record: Record) -> FirstModel | None:
     """Return delays, excitation and orders for a record; None for too few rows.
 
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
-    The first lags are the significant ones, unless from 1 or 0 on the best free run is clearly
-    better. Every model that is tried has a constant: without one, further lags make up
-    for the level of the signals.
+    Where all of them drift away, as those of an integrator or a light damping may, runs that start
+    again from measured lags decide: the longest whose best follows the output. The first lags are
+    the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model
+    that is tried has a constant: without one, further lags make up for the level of the signals.
     """
     record = _spread_windows(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -64,21 +75,53 @@ def first_model(record: Record) -> FirstModel | None:
     delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
-    chosen: tuple[float, Orders, tuple[float, ...]] | None = None
-    for nk in dict.fromkeys(
-        [*usual, *((late,) * len(delays) for late in (1, 0))]
-    ):  # a test may miss the first lags
-        found = _smallest(record, excited, nk)
-        if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
-            chosen = found
+    first_lags = [*dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))])]
+    chosen, restarted = _telling(record, excited, first_lags)
     if chosen is None:
         return None
-    return FirstModel(chosen[1], offset, delays, excited, chosen[2])
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2], restarted)
+
+
+def _telling(
+    record: Record, excited: tuple[int, ...], first_lags: Sequence[tuple[int, ...]]
+) -> tuple[_Choice | None, int | None]:
+    """Return the choice of the longest runs that follow the output, and after what they restart.
+
+    One without past outputs may win among runs that drift: it stays where runs of 100 rows confirm
+    it.
+    """
+    whole = _best_choice(record, excited, first_lags, None)
+    if whole is None or not record.inputs or (whole[0] < _TELLING and whole[1].na):
+        return whole, None
+    static, found = whole[0] < _TELLING, whole
+    for length in _RESTARTED[:2] if static else _RESTARTED:
+        tried = _best_choice(record, excited, first_lags, length)
+        if tried is None:
+            break
+        found = tried
+        if found[0] < (_DYNAMIC * whole[0] if static else _TELLING):
+            return found, length
+    return (whole, None) if static else (found, None if found is whole else length)
+
+
+def _best_choice(
+    record: Record,
+    excited: tuple[int, ...],
+    first_lags: Sequence[tuple[int, ...]],
+    length: int | None,
+) -> _Choice | None:
+    """Return the smallest orders near the best, from the first lags that are clearly better."""
+    chosen: _Choice | None = None
+    for nk in first_lags:  # a test may miss them
+        found = _smallest(record, excited, nk, length)
+        if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
+            chosen = found
+    return chosen
 
 
 def _smallest(
-    record: Record, excited: tuple[int, ...], nk: tuple[int, ...]
-) -> tuple[float, Orders, tuple[float, ...]] | None:
+    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], length: int | None
+) -> _Choice | None:
     """Return the least error of all orders from these first lags on, and the smallest near it.
 
     The error of the smallest orders comes with them.
@@ -86,7 +129,7 @@ def _smallest(
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
     for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
-        errors = _errors(record, orders)
+        errors = _errors(record, orders, length)
         if errors is not None and orders.size:
             tried.append((float(np.mean(errors)), orders.size, orders, errors))
     if not tried:
@@ -154,13 +197,16 @@ def _persistence(record: Record, number: int) -> int:
     return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
 
 
-def _errors(record: Record, orders: Orders) -> tuple[float, ...] | None:
+def _errors(record: Record, orders: Orders, length: int | None) -> tuple[float, ...] | None:
     """Return the error of the free run on the last rows for each output.
 
-    None where it cannot be fitted, or runs away.
+    It starts again from measured lags after `length` rows. None where it cannot be fitted, or runs
+    away.
     """
     first = _first_row(orders)
     usable = [e for e in record.experiments if len(e) > first + 1]
+    if length is not None:
+        usable = [piece for e in usable for piece in _cut(e, first, length)]
     rows = sum(len(e) - first for e in usable)
     cut, found = int(FITTED * rows), []
     for j in range(len(record.outputs)):
@@ -266,6 +312,12 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
             return None
         found.append(float(error))
     return tuple(found)
+
+
+def _cut(e: Experiment, first: int, length: int) -> list[Experiment]:
+    """Return pieces of so many rows, each with the lags before it."""
+    begins = range(0, len(e) - first, length)
+    return [e.rows(begin, begin + length + first) for begin in begins]
 
 
 def _first_row(orders: Orders) -> int:
