@@ -25,7 +25,6 @@ import coverage_choice
 import coverage_hidden
 import coverage_noise
 import coverage_shared
-import jax
 import numpy as np
 from machine import describe
 
@@ -108,7 +107,6 @@ def measure(part: str, lagged: int, motions: int) -> list[Row]:
             flush=True,
         )
         found.append(row)
-        jax.clear_caches()  # a process may map memory 65,530 times, and each program takes some
     return found
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import gc
 import os
 import platform
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,8 +53,7 @@ settings.register_profile(
 settings.load_profile("orthaug")
 
 
-# Of memory, of a worker: each compiled program takes some. 12,000 are 2 GB, and 65,530 all that Linux gives a process
-_MOST_MAPS = 12_000
+_MOST_MAPS = 0.18  # of those that Linux grants, of a worker: 12,000 are 2 GB
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -111,13 +107,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def _programs_are_let_go() -> Iterator[None]:
     """Let go of a worker's programs: thousands of them take gigabytes, and at last all maps of memory."""
     yield
-    maps = Path("/proc/self/maps")
-    if "jax" in sys.modules and maps.exists() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
-        sys.modules["jax"].clear_caches()
-        gc.collect()
-        if sys.platform == "linux":  # what is free goes back to the system: 2.0 GB become 0.6
-            with contextlib.suppress(OSError, AttributeError):
-                ctypes.CDLL("libc.so.6").malloc_trim(0)
+    from orthaug._base.jax import release_programs
+
+    release_programs(_MOST_MAPS)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -39,8 +39,8 @@ def fresh(tmp_path, monkeypatch) -> Iterator[None]:
     path, targets, modules = list(sys.path), dict(TARGETS), set(sys.modules)
     yield
     sys.path[:] = path
-    TARGETS.clear()
-    TARGETS.update(targets)
+    for kind in set(TARGETS) - set(targets):
+        TARGETS.remove(kind)
     for name in set(sys.modules) - modules:
         if str(getattr(sys.modules[name], "__file__", None) or "").startswith(
             (str(tmp_path), "mpc")

@@ -20,7 +20,8 @@ from test_cli import run
 
 import orthaug as oa
 from orthaug import FMU, InputError, Motion, Output, PhysicalParameter, Record, State
-from orthaug.physics import consent, source_kinds
+from orthaug._base import plugins
+from orthaug.physics import consent
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
 
@@ -352,7 +353,9 @@ def test_a_package_adds_a_source_by_an_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entry = EntryPoint("decay", "test_sources:Decay", "orthaug.systems")
-    monkeypatch.setattr(source_kinds, "entry_points", lambda group: (entry,))
+    monkeypatch.setattr(
+        plugins, "entry_points", lambda group: (entry,) if group == plugins.SOURCES else ()
+    )
     time = 0.1 * np.arange(60)
     level = 3 * np.exp(-0.8 * time) + 1e-3 * np.random.default_rng(3).normal(size=60)
     pd.DataFrame({"time": time, "h": level}).to_csv(tmp_path / "fall.csv", index=False)
@@ -369,10 +372,10 @@ def test_a_package_adds_a_source_by_an_entry_point(
     finally:
         if "decay" in SOURCES:
             SOURCES.remove("decay")
-    monkeypatch.setattr(source_kinds, "entry_points", lambda group: ())
+    monkeypatch.setattr(plugins, "entry_points", lambda group: ())
     with pytest.raises(InputError, match="of the kind 'decay', which is not known here"):
         oa.load(tmp_path / "result")
     broken = EntryPoint("decay", "no_such_package:Decay", "orthaug.systems")
-    monkeypatch.setattr(source_kinds, "entry_points", lambda group: (broken,))
+    monkeypatch.setattr(plugins, "entry_points", lambda group: (broken,))
     with pytest.raises(InputError, match="the source 'decay' of no_such_package:Decay cannot be"):
-        source_kinds.discover()
+        SOURCES.discover()

@@ -13,6 +13,7 @@ an error, or other numbers.
 from __future__ import annotations
 
 import functools
+import gc
 import hashlib
 import os
 import sys
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import PrecisionError
+from orthaug._base.memory import return_free_memory
 
 if TYPE_CHECKING:
     import jax
@@ -34,12 +36,15 @@ else:
     Array = Any
 
 _LENGTH = hashlib.sha256().digest_size
+_MAPS = 65_530  # of memory, that Linux grants a process unless it is told otherwise
+_MOST_MAPS = 0.5  # of these, up to which programs stay: one fit with its diagnosis takes 0.1
 __all__ = [
     "Array",
     "is_traced",
     "jax",
     "jnp",
     "padded_length",
+    "release_programs",
     "quick_jit",
     "starts",
     "use_compilation_cache",
@@ -242,6 +247,31 @@ if not TYPE_CHECKING:
         "jax" in sys.modules
     ):  # then it costs nothing, and what the user computes is in double precision too
         _real_jax()
+
+
+def release_programs(share: float = _MOST_MAPS) -> bool:
+    """Let compiled programs go if they take most of the process's memory maps; True if they did.
+
+    Each compiled program takes some maps, and Linux ends a process that asks for more than it
+    grants (65,530): a loop over hundreds of fits would crash. Those that are needed again are
+    compiled again, or come from disk.
+
+    Args:
+        share: of the maps that the system grants, up to which programs stay.
+    """
+    held, granted = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+    if "jax" not in sys.modules or not held.exists():
+        return False
+    try:
+        most = int(granted.read_text())
+    except (OSError, ValueError):
+        most = _MAPS
+    if held.read_bytes().count(b"\n") <= share * most:
+        return False
+    jax.clear_caches()
+    gc.collect()
+    return_free_memory()
+    return True
 
 
 def use_compilation_cache() -> None:

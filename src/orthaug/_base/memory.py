@@ -31,6 +31,13 @@ def limit() -> float:
     return math.inf if size == resource.RLIM_INFINITY else float(size)
 
 
+def return_free_memory() -> None:
+    """Give memory that is free back to the system, where the C library can (glibc)."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
 def check_limit(size: float, what: str) -> None:
     """Raise InputError where a limit on the process leaves less than `size` bytes.
 

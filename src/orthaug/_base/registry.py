@@ -22,6 +22,7 @@ from annotated_types import Ge, Gt, Le
 
 from orthaug._base.checks import check_choice, check_count, check_number, check_type, nearest
 from orthaug._base.errors import InputError, KeyedError
+from orthaug._base.plugins import discover
 
 LIBRARY_ONLY = {"library_only": True}
 """Metadata of a dataclass field that is no key of the spec: `field(default=…,
@@ -87,6 +88,8 @@ class Registry(Mapping[str, Any]):
         entries: the first declarations.
         reserved: keys that the section has beside those of the declarations.
         beside: another registry whose keys are in the same section.
+        group: entry points by which other packages add kinds (`_base/plugins.py`); "" for none.
+        follows: what every declaration must be a subclass of; None for any.
     """
 
     def __init__(
@@ -96,8 +99,11 @@ class Registry(Mapping[str, Any]):
         *,
         reserved: Collection[str] = ("kind",),
         beside: Registry | None = None,
+        group: str = "",
+        follows: type | None = None,
     ) -> None:
         self.axis = axis
+        self._group, self._follows = group, follows
         self._reserved = frozenset(reserved)
         self._entries: dict[str, type] = {}
         self._section = [self]
@@ -132,6 +138,8 @@ class Registry(Mapping[str, Any]):
             raise InputError(
                 f"the {self.axis} '{kind}' must be a frozen dataclass; got {declaration!r}."
             )
+        if self._follows is not None and not issubclass(declaration, self._follows):
+            raise InputError(f"the {self.axis} '{kind}' is no {self._follows.__name__}.")
         for key in keys_of(declaration).values():
             if key.name in self._reserved:
                 raise InputError(
@@ -148,6 +156,16 @@ class Registry(Mapping[str, Any]):
                             f"{same.annotation}; give one of them another name."
                         )
         self._entries[kind] = declaration
+
+    def discover(self) -> Registry:
+        """Add the kinds of installed packages, and return the registry itself.
+
+        Raises:
+            InputError: a package that cannot be imported, or whose kind cannot be added.
+        """
+        if self._group:
+            discover(self._group, self.axis, self._entries, self.add)
+        return self
 
     def remove(self, kind: str) -> None:
         """Take a declaration out again."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import whole_folder
+from orthaug._base.jax import release_programs
 from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress
 from orthaug._base.views import MAKERS
@@ -59,6 +60,7 @@ class FitReport(Examination):
 @one_blas_thread()
 def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
     """Train as the spec says, score every part, judge the learner, and try improvements."""
+    release_programs()
     return with_advice(doubt(with_verdict(fit_variant(job, AS_DECLARED, progress))))
 
 

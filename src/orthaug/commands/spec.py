@@ -62,7 +62,7 @@ from orthaug.physics.baseline import Baseline, Term
 from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.source_kinds import SOURCES, discover
+from orthaug.physics.source_kinds import SOURCES
 
 Orders = Count | list[Count]
 Regularization = (
@@ -584,10 +584,14 @@ def spec_error(error: KeyedError) -> InputError:
 
 
 def spec_model() -> type[Spec]:
-    """`Spec` with the keys of every kind that is registered now."""
+    """`Spec` with the keys of every kind that is registered now, or installed.
+
+    Raises:
+        InputError: a package with a kind that cannot be loaded.
+    """
     return _spec_model(
         tuple(
-            tuple(registry.items())
+            tuple(registry.discover().items())
             for registry in (
                 LEARNERS,
                 MEASURES,
@@ -641,9 +645,6 @@ def load_spec(path: Path) -> Spec:
         raise SpecError(f"{path}: cannot be read ({error.strerror}).") from None
     except ValueError as error:  # a whole number of thousands of digits
         raise SpecError(f"{path}: broken TOML: {str(error).split(';')[0]}.") from None
-    physics = content.get("physics")
-    if isinstance(physics, Mapping) and "source" in physics:
-        discover()
     model = spec_model()
     try:
         return model.model_validate(content, context={"folder": path.parent})

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError, MissingFileError
 from orthaug._base.memory import check_memory
+from orthaug._base.plugins import READERS, discover
 from orthaug._base.progress import LOG
 from orthaug.data.headers import in_seconds, parse_dates
 from orthaug.data.layouts import (
@@ -76,11 +77,7 @@ def read_table(
             columns.
     """
     check_readable(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise InputError(
-            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
-        )
+    reader = _reader_of(path)
     with foreign(path):
         part = {"most": most} if reader is _read_text else {}
         table = reader(path, columns, time, **part)
@@ -109,12 +106,10 @@ def column_names(path: Path) -> list[str]:
         InputError: no such file, an unknown ending, content that does not fit it.
     """
     check_readable(path)
-    ending = path.suffix.lower()
-    if ending not in _READERS:
-        raise InputError(
-            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
-        )
+    ending, reader = path.suffix.lower(), _reader_of(path)
     with foreign(path):
+        if isinstance(reader, _PackageReader):
+            return list(reader.read(path))
         if ending in ENDINGS:
             return variable_names(path)
         if ending == ".parquet":
@@ -418,6 +413,45 @@ _READERS: dict[str, Callable[..., Table]] = {
     ".xlsx": _read_excel,
     **dict.fromkeys(ENDINGS, _read_variables),
 }
+
+
+@dataclass(frozen=True)
+class _PackageReader:
+    """A reader of another package: columns by name from a path."""
+
+    read: Callable[[Path], Mapping[str, Any]]
+
+    def __call__(self, path: Path, columns: Sequence[str], time: str | None) -> Table:
+        found = self.read(path)
+        check_present(path, columns, list(found))
+        return _full_table(
+            path, {name: _as_floats(np.asarray(found[name]), name, path) for name in columns}
+        )
+
+
+def _reader_of(path: Path) -> Callable[..., Table]:
+    """Return the reader of a file's type, which an installed package may have.
+
+    Raises:
+        InputError: an unknown ending, or a package that cannot be loaded.
+    """
+    ending = path.suffix.lower()
+    if ending not in _READERS:
+        endings = [known.removeprefix(".") for known in _READERS]
+        discover(READERS, "reader", endings, _add_reader)
+    if ending not in _READERS:
+        raise InputError(
+            f"{path}: unknown file type '{path.suffix}'; known are {', '.join(_READERS)}."
+        )
+    return _READERS[ending]
+
+
+def _add_reader(ending: str, read: Any) -> None:
+    if not callable(read):
+        raise InputError(f"the reader '{ending}' is no function of a path.")
+    _READERS[f".{ending.lower()}"] = _PackageReader(cast(Any, read))
+
+
 KNOWN = tuple(_READERS)
 """Endings of the files that can be read."""
 

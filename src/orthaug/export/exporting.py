@@ -54,6 +54,8 @@ def check_target(to: str) -> str:
     Raises:
         InputError: none of that name; the nearest is named.
     """
+    if isinstance(to, str) and to not in TARGETS and to not in written_back.targets():
+        TARGETS.discover()
     known = (*TARGETS, *written_back.targets())
     if not isinstance(to, str) or to not in known:
         hint = nearest(to, known) if isinstance(to, str) else ""

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
+from orthaug._base import plugins
+from orthaug._base.registry import Registry
 from orthaug.export.c_source import CSource
 from orthaug.export.fmu import Fmu
 from orthaug.export.latex_text import LatexText
@@ -38,12 +40,16 @@ class Target(Protocol):
         ...
 
 
-TARGETS: dict[str, type[Target]] = {
-    "c": CSource,
-    "casadi": CasadiModule,
-    "control": ControlModule,
-    "fmu": Fmu,
-    "numpy": NumpyModule,
-    "onnx": OnnxGraph,
-    "latex": LatexText,
-}
+TARGETS = Registry(
+    "export",
+    {
+        "c": CSource,
+        "casadi": CasadiModule,
+        "control": ControlModule,
+        "fmu": Fmu,
+        "numpy": NumpyModule,
+        "onnx": OnnxGraph,
+        "latex": LatexText,
+    },
+    group=plugins.EXPORTERS,
+)

@@ -9,6 +9,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import check_type
+from orthaug._base.jax import release_programs
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import with_progress
 from orthaug.data.record import Record
@@ -178,6 +179,7 @@ def estimate(
         >>> f"{fit.theta[0]:.3f}"
         '2.000'
     """
+    release_programs()
     if isinstance(baseline, System):
         baseline = baseline.motion(rows_in_memory(record))
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")

@@ -15,6 +15,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
+from orthaug._base import plugins
 from orthaug._base.errors import InputError, KeyedError
 from orthaug._base.registry import Option, Registry
 from orthaug.data.readers import read_record, read_samples
@@ -106,4 +107,5 @@ MEASURES = Registry(
         "samples": SampleFiles,
         "weighted": WeightFiles,
     },
+    group=plugins.MEASURES,
 )

@@ -480,7 +480,7 @@ def _rebuild_learner(kept: dict[str, Any], given: Learner | None, path: Path) ->
     For a callable it is the given one.
     """
     kind = kept["kind"]
-    if kind in LEARNERS:
+    if kind in LEARNERS or (given is None and kind != "callable" and kind in LEARNERS.discover()):
         learner = LEARNERS[kind]
         return learner(
             **{name: freeze(kept[name]) for name in _field_names(learner) if name in kept}

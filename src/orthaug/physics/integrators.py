@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from orthaug._base import plugins
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
@@ -182,7 +183,10 @@ class Discrete(Integrator):
 
 
 INTEGRATORS = Registry(
-    "integrator", {"rk4": RungeKutta4, "exact": Exponential, "discrete": Discrete}
+    "integrator",
+    {"rk4": RungeKutta4, "exact": Exponential, "discrete": Discrete},
+    group=plugins.INTEGRATORS,
+    follows=Integrator,
 )
 
 

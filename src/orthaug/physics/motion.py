@@ -260,6 +260,8 @@ class Motion(NotebookView):
         hold: str,
         defined: Sequence[str] = (),
     ) -> Motion:
+        if integrator not in INTEGRATORS:
+            INTEGRATORS.discover()
         check_choice(integrator, INTEGRATORS, "`integrator`")
         check_choice(hold, HOLDS, "`hold`")
         whole = isinstance(substeps, int | np.integer) and not isinstance(substeps, bool)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from orthaug._base import plugins
 from orthaug._base.errors import InputError
 from orthaug._base.registry import Registry
 from orthaug.physics.consent import CONSENTS
@@ -15,9 +15,9 @@ from orthaug.physics.mechanisms import MuJoCo
 from orthaug.physics.motion import Origin
 from orthaug.physics.sources import FileSource, PhysicsSource
 
-GROUP = "orthaug.systems"
-"""The group of entry points: name of the kind, and a subclass of `PhysicsSource`."""
-SOURCES = Registry("source", {"fmu": FMU, "mujoco": MuJoCo})
+SOURCES = Registry(
+    "source", {"fmu": FMU, "mujoco": MuJoCo}, group=plugins.SOURCES, follows=PhysicsSource
+)
 """Sources by kind."""
 
 
@@ -50,7 +50,7 @@ def rebuild(declared: Mapping[str, Any], folder: Path) -> PhysicsSource:
     """
     keys = {name: value for name, value in declared.items() if name not in ("kind", "sha256")}
     if declared["kind"] not in SOURCES:
-        discover()
+        SOURCES.discover()
     if declared["kind"] not in SOURCES:
         raise InputError(
             f"{folder}: its physics are of the kind '{declared['kind']}', which is not known here; "
@@ -74,27 +74,3 @@ def rebuild(declared: Mapping[str, Any], folder: Path) -> PhysicsSource:
 
 def _as_tuples(keys: Mapping[str, Any]) -> dict[str, Any]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in keys.items()}
-
-
-def discover() -> None:
-    """Add the kinds of packages that are installed, by their entry points.
-
-    Raises:
-        InputError: a package that cannot be imported, or whose entry is no source.
-    """
-    for entry in entry_points(group=GROUP):
-        if entry.name in SOURCES:
-            continue
-        try:
-            declared = entry.load()
-        except Exception as error:  # whatever a package does when it is imported
-            raise InputError(
-                f"the source '{entry.name}' of {entry.value} cannot be loaded ({error}); update or "
-                "remove its package."
-            ) from None
-        if not (isinstance(declared, type) and issubclass(declared, PhysicsSource)):
-            raise InputError(
-                f"the source '{entry.name}' of {entry.value} is no PhysicsSource; update or remove "
-                "its package."
-            )
-        SOURCES.add(entry.name, declared)
