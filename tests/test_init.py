@@ -734,7 +734,7 @@ def test_an_integrator_gets_the_orders_of_runs_that_start_again(tmp_path, monkey
     y = np.cumsum(speed) + 1e-3 * rng.normal(size=1200)
     file = write_columns(tmp_path / "a.csv", u=u, y=y)
     done = run("init", file, "--out", tmp_path / "a.toml")
-    assert done.code == 0 and "orders are those of the best runs that start again" in done.out
+    assert done.code == 0 and "orders are the best of runs that start again" in done.out
     assert "y[k-2]" in (tmp_path / "a.toml").read_text()
 
 

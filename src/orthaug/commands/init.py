@@ -586,9 +586,8 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            "no linear model follows the outputs over all held-out rows; orders are those of the "
-            f"best runs that start again from measured lags every {model.restarted} rows, with an "
-            f"error of {shown}"
+            "no linear model follows the outputs over all held-out rows; orders are the best of "
+            f"runs that start again every {model.restarted} rows, with an error of {shown}"
         )
     if cut - missing > LOOKED_AT:
         lines.append(
