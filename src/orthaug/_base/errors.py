@@ -74,7 +74,7 @@ class InputError(ValueError):
     code: ClassVar[str] = "input_invalid"
     """For programs, in words_with_underscores; each kind of error has its own."""
     in_result = False
-    """Whether the result that was printed as JSON says it already."""
+    """True if the result that was printed as JSON says it already."""
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))
@@ -147,7 +147,7 @@ class TrainingError(ArithmeticError):
 
     code: ClassVar[str] = "training_failed"
     in_result = False
-    """Whether the result that was printed as JSON says it already."""
+    """True if the result that was printed as JSON says it already."""
 
     def __init__(self, text: str = "") -> None:
         super().__init__(message(str(text)))

@@ -50,7 +50,7 @@ class TermResponse(NamedTuple):
     held: Matrix | None
     """What the learner holds of it at the measure's points, weighted (M, ny); None without one."""
     seen: bool | None = None
-    """Whether it is a function of what the learner sees; None where that does not matter."""
+    """True if it is a function of what the learner sees; None where that does not matter."""
     certified: Matrix | None = None
     """The values that a certificate is sought for, weighted; None for no certificate."""
     moved_by_split: Vector | None = None
@@ -90,7 +90,7 @@ class TermPhysics(Protocol):
 
     @property
     def certifies(self) -> bool:
-        """Whether the points are few enough to seek certificates for terms that no one named."""
+        """True if the points are few enough to seek certificates for terms that no one named."""
         ...
 
     def equation(self, suspect: Any) -> str | None:
@@ -146,7 +146,7 @@ class SuspectedBias:
     equation: str | None = None
     """The equation of a motion that lacks the term."""
     seen: bool | None = None
-    """Whether it is a function of what the learner sees, where that leaves some directions of θ to
+    """True if it is a function of what the learner sees, where that leaves some directions of θ to
     the fit.
     """
     size: float | None = None
@@ -160,7 +160,7 @@ class SuspectedBias:
     physics_cosine: float | None = None
     """Cosine between what the learner holds of the term and the shared directions."""
     split: bool = True
-    """Whether a measure decides on any direction; without a learner a free run decides alone."""
+    """True if a measure decides on any direction; without a learner a free run decides alone."""
 
     @property
     def per_unit(self) -> Vector:

@@ -74,7 +74,7 @@ class ParameterBias:
     ci95: tuple[float, float] | None
     """The hull over all causes that noise cannot separate; None where that determines nothing."""
     determined: bool = True
-    """Whether the data determine the parameter beside this learner: the hull is no wider than the
+    """True if the data determine the parameter beside this learner: the hull is no wider than the
     value itself.
     """
 

@@ -53,12 +53,12 @@ class Considered:
     it: there a form is better only by more than that.
     """
     joint: bool = False
-    """Whether terms of several equations explain the learner together. A term of a motion, such as
+    """True if terms of several equations explain the learner together. A term of a motion, such as
     a force between two masses, acts in several equations and moves parameters that they share;
     outputs of difference equations are looked at one by one instead.
     """
     seen_only: bool = False
-    """Whether only terms that the learner sees can be compared. What a learner holds of another is
+    """True if only terms that the learner sees can be compared. What a learner holds of another is
     a regression on its features for difference equations; of a motion it would take a fit.
     """
 

@@ -148,7 +148,7 @@ class Candidates:
     skip: int
     own: bool = False
     measured: bool = False
-    """Whether sensitivities are those along the measured outputs; the response is then the
+    """True if sensitivities are those along the measured outputs; the response is then the
     prediction.
     """
 

@@ -1,4 +1,4 @@
-"""What a fit is judged by, beside itself: the parts of the data and what was declared about it."""
+"""Evidence that a fit is judged by, beside itself: parts of the data, and declarations."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Evidence:
     map: PhysicsMap | None = None
     """From physical parameters to θ."""
     profiles: bool = False
-    """Whether physical parameters get profile intervals, too."""
+    """True if physical parameters get profile intervals, too."""
     blocks: int | None = None
     """Blocks of cross-validation; None for none beside held-out parts, else `DEFAULT_BLOCKS`."""
     runner: Any = InMemory()  # noqa: RUF009  (frozen)

@@ -79,7 +79,7 @@ class BiasResult(Content):
     cause: str
     share: Number
     determined: Flag = True
-    """Whether the causes that noise cannot distinguish agree enough for a useful interval."""
+    """True if the causes that noise cannot distinguish agree enough for a useful interval."""
 
 
 class PhysicalBias(Content):

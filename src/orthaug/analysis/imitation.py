@@ -65,7 +65,7 @@ class Imitation:
     physical: tuple[str, ...] | None = None
     alternatives: tuple[Alternative, ...] = ()
     terms: bool = False
-    """Whether the learner can be linear combinations of its inputs only."""
+    """True if the learner can be linear combinations of its inputs only."""
     held: tuple[str, ...] = ()
     """Parameters at a bound: known terms, along which nothing is split off."""
     weakest: tuple[str, float] | None = None

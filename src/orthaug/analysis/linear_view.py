@@ -130,7 +130,7 @@ class LinearView:
     freedom: float
     warnings: tuple[Warning, ...]
     smooth: bool = False
-    """Whether inputs run smoothly between samples (a spline), so that `bode` is the response of the
+    """True if inputs run smoothly between samples (a spline), so that `bode` is the response of the
     equations.
     """
 

@@ -187,7 +187,7 @@ class MissingTerm:
     coefficient: float
     share: float
     one_sided: bool = False
-    """Whether the variable keeps its sign over the data: nothing is then known of odd and even."""
+    """True if the variable keeps its sign over the data: nothing is then known of odd and even."""
 
     @property
     def expression(self) -> str:

@@ -54,7 +54,7 @@ class ResidualTest:
     acf_band: float | None
     ljung_box: LjungBox | None
     white: bool | None
-    """Whether Ljung-Box does not reject at `level`."""
+    """True if Ljung-Box does not reject at `level`."""
     order: int | None
     """Order of the autoregression that models the residual's colour."""
     cross: Mapping[str, CrossTest | None]

@@ -95,7 +95,7 @@ class Finding:
     noise: float | None
     sensor: bool = False
     complete: bool = False
-    """Whether no test finds anything that matters."""
+    """True if no test finds anything that matters."""
     free_tests: tuple[ResidualTest, ...] | None = None
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()

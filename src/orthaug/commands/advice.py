@@ -46,7 +46,7 @@ class Proposal:
     words: str
     change: dict[str, Any]
     learns: bool = False
-    """Whether the change is about a learner: a fit of physics alone would not show its effect."""
+    """True if the change is about a learner: a fit of physics alone would not show its effect."""
     refocuses: bool = False
     positive: str | None = None
     """A parameter that has to be positive, such as the size of a dead zone."""

@@ -56,7 +56,7 @@ class ControllerSection(Section):
 
     @property
     def way(self) -> str:
-        """How the controller is given."""
+        """Way in which the controller is given."""
         return next(way for way, keys in self.ways.items() if self.model_fields_set & {*keys})
 
     @model_validator(mode="after")

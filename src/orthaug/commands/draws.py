@@ -41,7 +41,7 @@ _ANSWERED = frozenset({"biased"})  # with an interval of its own, which then has
 
 @dataclass(frozen=True)
 class Asked:
-    """What a rehearsal is asked for.
+    """Request for a rehearsal.
 
     Args:
         draws: data sets that are simulated and fitted.

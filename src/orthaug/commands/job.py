@@ -85,7 +85,7 @@ class JobPhysics(ABC, Generic[P, F]):
     section: ClassVar[str]
     """The section of a spec that declares it."""
     runs_in_check: ClassVar[bool]
-    """Whether `check` computes free runs, for which JAX is needed."""
+    """True if `check` computes free runs, for which JAX is needed."""
     most_trials: ClassVar[int]
     """Changes that advice tries: together they take about as long as the fit."""
     suspects: tuple[Any, ...] = ()
@@ -319,7 +319,7 @@ class Job:
 
     @property
     def evidence(self) -> Evidence:
-        """What a fit of this job is judged by."""
+        """Evidence that a fit of this job is judged by."""
         spec = self.spec
         return Evidence(
             parts=self.parts,

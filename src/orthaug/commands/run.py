@@ -39,7 +39,7 @@ class ReadOptions:
     every: int = 1
     columns: Mapping[str, str] = field(default_factory=dict)
     prepare: bool | None = None
-    """Whether the rows go through the preparation of the training data; None where that is open.
+    """True if the rows go through the preparation of the training data; None where that is open.
     """
 
     @classmethod
@@ -81,7 +81,7 @@ class ModelOnData:
     notes: tuple[str, ...] = ()
     warnings: tuple[Warning, ...] = ()
     withheld: bool = False
-    """Whether its fit gave no standard errors, for a reason that other parameters share."""
+    """True if its fit gave no standard errors, for a reason that other parameters share."""
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:

@@ -402,7 +402,7 @@ class Record(NotebookView):
 
     @property
     def even(self) -> bool:
-        """Whether the rows of all experiments are `sampling_time` apart."""
+        """True if the rows of all experiments are `sampling_time` apart."""
         return all(experiment.steps is None for experiment in self.experiments)
 
     @property

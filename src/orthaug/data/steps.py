@@ -41,7 +41,7 @@ class Run:
     """Rows that were cut off at the begin."""
     stride: int = 1
     moved: bool = False
-    """Whether the samples are no rows of the file any more."""
+    """True if the samples are no rows of the file any more."""
 
     def columns(self, channels: Channels, usual: range | None = None) -> list[int]:
         """Return indices of channels.

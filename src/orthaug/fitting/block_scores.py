@@ -59,7 +59,7 @@ class FreeRunScores:
 
     @property
     def followed(self) -> Float[np.ndarray, "k m n0 n"] | None:
-        """How the best states follow the unknowns of the fit, less its sign."""
+        """Derivative of the best states by the unknowns of the fit, less its sign."""
         return self.slope
 
     @property

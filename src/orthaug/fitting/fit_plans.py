@@ -1,4 +1,4 @@
-"""How a problem is fitted: what was asked for, rules of each kind of physics, tasks to train.
+"""Plans of a fit: the request, rules of each kind of physics, tasks to train.
 
 `fit` goes the same way for every kind: it checks the request, has tasks and starts made, trains and
 finishes. A kind of physics says in a `FitPlan` what of that is its own. A new kind is one of these
@@ -81,7 +81,7 @@ class Request:
     checkpoints: Checkpoints | None = None
     noise: Noise = "white"
     briefly: bool = False
-    """Whether the model only has to simulate."""
+    """True if the model only has to simulate."""
 
     @property
     def warm(self) -> bool:

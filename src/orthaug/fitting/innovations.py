@@ -77,7 +77,7 @@ class MarginalScores(FreeRunScores):
 
     @property
     def followed(self) -> Float[np.ndarray, "k m n0 a"] | None:
-        """How the best states follow (c, w) under the gain of the fit, less its sign."""
+        """Derivative of the best states by (c, w) under the gain of the fit, less its sign."""
         kept = np.flatnonzero((self.moved == 1.0).any(axis=1))
         return None if self.slope is None else self.slope[..., kept]
 

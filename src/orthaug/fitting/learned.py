@@ -63,7 +63,7 @@ class TrainedLearner:
     tail: Tail | None = None
     """The last steps of its run; None for what was solved."""
     elsewhere: bool = False
-    """Whether it is a function from another toolbox."""
+    """True if it is a function from another toolbox."""
 
 
 @runtime_checkable

@@ -203,7 +203,7 @@ class TrainingRowsModel(NamedTuple):
     used: float
     """Degrees of freedom that the learner has used up."""
     robust: bool
-    """Whether the covariance counts the colour of the errors."""
+    """True if the covariance counts the colour of the errors."""
 
 
 def training_rows(fit: Any, training: Record | None) -> TrainingRowsModel:

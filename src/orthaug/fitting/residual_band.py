@@ -94,7 +94,7 @@ class ResidualMonitor:
     level: float = 0.0
     """The largest g over its limit, above 1 for an alarm."""
     armed: bool = True
-    """Whether the next level above 1 is a new alarm: one that has come back below a half."""
+    """True if the next level above 1 is a new alarm: one that has come back below a half."""
 
     def __post_init__(self) -> None:
         reference = self.reference

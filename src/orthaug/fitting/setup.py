@@ -1,4 +1,4 @@
-"""How an estimate was made: its problem and the options of training, by which it is made again."""
+"""Setup of an estimate: its problem and the options of training, by which it is made again."""
 
 from __future__ import annotations
 

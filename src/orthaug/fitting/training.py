@@ -90,11 +90,11 @@ class Choice:
     ensemble: bool = False
     scored: bool = False
     retry: bool = False
-    """Whether runs that evidence silenced are made again with weaker regularizations, if held-out
+    """True if runs that evidence silenced are made again with weaker regularizations, if held-out
     rows can choose.
     """
     briefly: bool = False
-    """Whether the chosen run only has to simulate."""
+    """True if the chosen run only has to simulate."""
 
     def compares(self, task: Task, starts: Sequence[PlannedRun]) -> bool:
         """Return whether held-out errors choose between runs or regularizations.

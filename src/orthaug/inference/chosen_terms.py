@@ -1,4 +1,4 @@
-"""Where the intervals of a fit come from whose terms were chosen."""
+"""Origin of the intervals of a fit whose terms were chosen."""
 
 from __future__ import annotations
 

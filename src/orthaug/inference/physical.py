@@ -83,7 +83,7 @@ class _Fit:
     target: Vector
     whiten: Matrix
     known: bool
-    """Whether K comes from a covariance; otherwise from |θ̂|."""
+    """True if K comes from a covariance; otherwise from |θ̂|."""
     free: tuple[int, ...]
 
     @classmethod

@@ -270,7 +270,7 @@ class MotionSplit(Split):
     """
     field: Field
     of_rows: bool = False
-    """Whether the points are those of the training rows."""
+    """True if the points are those of the training rows."""
 
     @classmethod
     def empty(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:

@@ -110,7 +110,7 @@ class Dynamics(Protocol):
 
     @property
     def entries(self) -> tuple[Expression, ...]:
-        """What the learner sees, as expressions."""
+        """Expressions that the learner sees."""
         ...
 
     @property
@@ -130,7 +130,7 @@ class Dynamics(Protocol):
 
     @property
     def steps_unevenly(self) -> bool:
-        """Whether a step may take another time than `sampling_time`, as between uneven instants."""
+        """True if a step may take another time than `sampling_time`, as between uneven instants."""
         ...
 
     @property

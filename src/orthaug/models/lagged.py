@@ -45,7 +45,7 @@ class LaggedDynamics:
 
     @property
     def entries(self) -> tuple[Expression, ...]:
-        """What the learner sees, as expressions."""
+        """Expressions that the learner sees."""
         return self.features.entries
 
     @property

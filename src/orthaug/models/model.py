@@ -98,7 +98,7 @@ class Model(RecordModel[Form], NotebookView):
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
     starts: Starts = field(default=PastOutputs(), kw_only=True, repr=False)  # noqa: RUF009
-    """Where the state of a run comes from."""
+    """Origin of the state of a run."""
     trained: TrainedSegments | None = field(default=None, kw_only=True, repr=False)
     """Of a motion: how it was trained."""
     seen: Matrix | None = field(default=None, kw_only=True, repr=False)

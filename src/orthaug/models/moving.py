@@ -191,7 +191,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def entries(self) -> tuple[Expression, ...]:
-        """What the learner sees, as expressions."""
+        """Expressions that the learner sees."""
         return self.features
 
     @property

@@ -44,7 +44,7 @@ class RecordModel(Generic[Form]):
 
     @property
     def coloured(self) -> bool:
-        """Whether a noise model forecasts errors."""
+        """True if a noise model forecasts errors."""
         return self.noise is not None and not self.noise.white
 
     @property

@@ -47,7 +47,7 @@ class Predicted(NamedTuple):
 
 @runtime_checkable
 class Starts(Protocol):
-    """Where the state of a run comes from."""
+    """Origin of the state of a run."""
 
     def rows(self, form: Any) -> int:
         """Return how many rows of measured outputs determine a state."""

@@ -98,7 +98,7 @@ class Statistics:
     ridge: float | Vector = 0.0
     freedom: float = np.inf
     simulated: bool = False
-    """Whether `noise` is of a free run's errors, and not of those one step ahead."""
+    """True if `noise` is of a free run's errors, and not of those one step ahead."""
     verdict: str = ""
     """Diagnosis of the residual (`analysis.Diagnosis`); empty where none was asked for."""
     disturbance: Matrix | None = None

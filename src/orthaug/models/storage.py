@@ -245,9 +245,9 @@ class _Physics(NamedTuple):
     fields: Callable[[dict[str, Any], dict[str, np.ndarray], Any, Bound], dict[str, Any]]
     """Returns the form and the other fields that only these models have."""
     adds_to_outputs: bool
-    """Whether a learner adds to every output."""
+    """True if a learner adds to every output."""
     simulated: bool
-    """Whether files that do not say so were trained on a free run."""
+    """True if files that do not say so were trained on a free run."""
 
 
 def _declare_lagged(

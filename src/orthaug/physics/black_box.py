@@ -18,7 +18,7 @@ from orthaug._base.host_calls import call_on_host
 from orthaug._base.jax import jax, jnp
 
 Groups = tuple[bool, bool, bool]
-"""Whether x, u and p are each among the variables of slopes."""
+"""True if x, u and p are each among the variables of slopes."""
 
 
 @runtime_checkable

@@ -22,13 +22,13 @@ class Consents:
     def __init__(self) -> None:
         self._given: set[str] = set()
         self.to_all = False
-        """Whether code runs whatever file it is in."""
+        """True if code runs whatever file it is in."""
         self.kept = False
-        """Whether what is given is kept for later processes."""
+        """True if what is given is kept for later processes."""
 
     @property
     def file(self) -> Path:
-        """Where consents are kept, one sha256 a line."""
+        """File of the consents, one sha256 a line."""
         import platformdirs
 
         return platformdirs.user_state_path("orthaug") / "fmus"

@@ -101,7 +101,7 @@ class InnovationsModel:
 
     @property
     def white(self) -> bool:
-        """Whether the states follow no output: white noise on the sensor."""
+        """True if the states follow no output: white noise on the sensor."""
         return not np.any(self.gain)
 
     @property

@@ -128,13 +128,13 @@ class Integrator:
     """
 
     discrete: ClassVar[bool] = False
-    """Whether the equations give the next state, and nothing is integrated."""
+    """True if the equations give the next state, and nothing is integrated."""
     widest_angle: ClassVar[float | None] = 0.1
     """|λ| h of the fastest mode λ in the substeps h that training begins with; None for any."""
     splits_linear_part: ClassVar[bool] = False
-    """Whether a step needs the `Exponentials` of the part that is linear at the origin."""
+    """True if a step needs the `Exponentials` of the part that is linear at the origin."""
     has_adjoint: ClassVar[bool] = False
-    """Whether `models.moving` has hand-written slopes of its stages."""
+    """True if `models.moving` has hand-written slopes of its stages."""
 
     def step(self, field: Field, h: float, scheme: Any = None, *, looped: bool = False) -> Step:
         """Return a step of length h.

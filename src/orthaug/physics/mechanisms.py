@@ -26,7 +26,7 @@ _SIGNIFICANT = 1e-12  # to which a written file gives the same numbers again
 
 @dataclass(frozen=True)
 class Place:
-    """Where a parameter is: an entry of an array of MuJoCo's model."""
+    """Place of a parameter: an entry of an array of MuJoCo's model."""
 
     array: str
     index: tuple[int, ...]
@@ -120,7 +120,7 @@ class Mechanism:
 
     @property
     def slides(self) -> list[bool]:
-        """Whether each joint slides; the others turn."""
+        """True if each joint slides; the others turn."""
         mujoco, _ = _modules(self.file)
         slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
         return [int(kind) == slide for kind in self.compiled.jnt_type]
@@ -132,7 +132,7 @@ class Mechanism:
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """Where each parameter is, by its name."""
+        """Place of each parameter, by its name."""
         found: dict[str, Place] = {}
         for i, name in enumerate(self.names("body")):
             if i == 0 or not self.compiled.body_mass[i]:
@@ -156,7 +156,7 @@ class Mechanism:
 
     @property
     def constrained(self) -> bool:
-        """Whether a solver of constraints is needed: friction, limits, equalities."""
+        """True if a solver of constraints is needed: friction, limits, equalities."""
         own = self.compiled
         limited = bool(own.jnt_limited.any()) or bool(own.tendon_limited.any())
         return limited or own.neq > 0 or bool((own.dof_frictionloss > 0).any())

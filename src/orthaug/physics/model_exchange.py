@@ -112,7 +112,7 @@ class Evaluation:
 
     @cached_property
     def _directional(self) -> bool:
-        """Whether the FMU gives the derivatives by states and inputs."""
+        """True if the FMU gives the derivatives by states and inputs."""
         described = self.unit.description
         own = {v.valueReference for v in described.modelVariables if v.causality == "output"}
         provided = described.modelExchange.providesDirectionalDerivative

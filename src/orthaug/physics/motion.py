@@ -37,16 +37,16 @@ _DERIVATIVE = "derivative of "
 
 @runtime_checkable
 class Origin(Protocol):
-    """What the functions of a motion come from; `physics.sources` has them."""
+    """Origin of a motion's functions; `physics.sources` has them."""
 
     @property
     def operations(self) -> int:
-        """How many operations the functions have, roughly, where they are JAX's; 0 for few."""
+        """Rough number of operations of the functions, where they are JAX's; 0 for few."""
         ...
 
     @property
     def compiled(self) -> bool:
-        """Whether the functions are JAX's; others are calls of the host at every point."""
+        """True if the functions are JAX's; others are calls of the host at every point."""
         ...
 
     @property

@@ -237,7 +237,7 @@ class RowFilter:
     lengths: tuple[int, ...]
     skip: int | None = None
     fixed: bool = False
-    """Whether the coefficients are known, not estimated from these rows."""
+    """True if the coefficients are known, not estimated from these rows."""
 
     @property
     def skipped(self) -> int:

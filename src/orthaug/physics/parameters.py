@@ -75,7 +75,7 @@ class Coordinates:
 
     parameters: Sequence[Parameter | PhysicalParameter]
     logarithms: bool = True
-    """Whether positive parameters are estimated as logarithms; θ that is solved for is not."""
+    """True if positive parameters are estimated as logarithms; θ that is solved for is not."""
 
     @property
     def positive(self) -> Bool[np.ndarray, "np"]:

@@ -355,7 +355,7 @@ class Problem(PosedProblem):
 
 @dataclass(frozen=True)
 class _Poser:
-    """What a problem is posed by, without its rows."""
+    """Ingredients of a problem, without its rows."""
 
     baseline: Baseline
     layout: Layout

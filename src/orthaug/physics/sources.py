@@ -72,17 +72,17 @@ class PhysicsSource:
 
     @property
     def operations(self) -> int:
-        """How many operations its functions have, roughly, where they are JAX's; 0 for few."""
+        """Rough number of operations of its functions, where they are JAX's; 0 for few."""
         return 0
 
     @property
     def compiled(self) -> bool:
-        """Whether its functions are JAX's; others are calls of the host at every point."""
+        """True if its functions are JAX's; others are calls of the host at every point."""
         return True
 
     @property
     def learns(self) -> bool:
-        """Whether a learner is added to any equation or output."""
+        """True if a learner is added to any equation or output."""
         return bool(getattr(self, "learned", ()))
 
     @property
@@ -157,7 +157,7 @@ class FileSource(PhysicsSource):
     ending: ClassVar[str] = ""
     """Of the file that a saved model keeps."""
     native: ClassVar[bool] = False
-    """Whether it holds code that runs with the user's rights."""
+    """True if it holds code that runs with the user's rights."""
     target: ClassVar[str] = ""
     """The name after `orthaug export --to` under which `write_back` is found."""
 

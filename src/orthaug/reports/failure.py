@@ -28,7 +28,7 @@ class ErrorResult(Content):
 
 
 class FailureResult(Content):
-    """What a command prints instead of its result where `--json` is given."""
+    """Error that a command prints instead of its result where `--json` is given."""
 
     error: ErrorResult
 

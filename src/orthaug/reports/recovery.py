@@ -108,7 +108,7 @@ class NoiseOfDraws(Content):
 
 
 class IntervalsOfDraw(Content):
-    """What a draw shows of a parameter."""
+    """Intervals of a parameter in one draw."""
 
     value: Number
     ci95: Numbers | None
@@ -147,7 +147,7 @@ class RecoverResult(ResultHeader):
     choices: list[ChoiceResult]
     outcomes: list[DrawResult]
     designs: Flag
-    """Whether the spec has a [design], whose input is among the choices."""
+    """True if the spec has a [design], whose input is among the choices."""
     seconds: Number
     stored: Whole
     """Draws that were read from the folder."""

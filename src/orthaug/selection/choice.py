@@ -81,7 +81,7 @@ class Selection:
     learners: LearnerSearch | None
     notes: tuple[Warning, ...]
     stopped: bool = False
-    """Whether the search was stopped before its end; what it had found by then was chosen from."""
+    """True if the search was stopped before its end; what it had found by then was chosen from."""
     physics: PhysicsComparison | None = None
     """θ of physics alone beside θ with the chosen terms; None where no terms were searched, or
     there is no physics.

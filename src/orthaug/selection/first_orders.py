@@ -47,7 +47,7 @@ class FirstModel:
 
     orders: Orders
     offset: bool
-    """Whether the signals have a level, so that the physics needs a constant."""
+    """True if the signals have a level, so that the physics needs a constant."""
     delays: tuple[int | None, ...]
     """First lag of each input that is significant beside the output's own past; None where none is.
     """

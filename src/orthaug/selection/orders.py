@@ -108,7 +108,7 @@ class OrderSearch(Search):
 
     orders: tuple[Orders, ...]
     constant: bool = False
-    """Whether the choice needs a constant that the physics does not have."""
+    """True if the choice needs a constant that the physics does not have."""
 
     @property
     def chosen(self) -> Orders:

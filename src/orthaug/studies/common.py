@@ -86,9 +86,9 @@ class Finding(NamedTuple):
     published: str = ""
     scripts: str = ""
     as_published: bool | None = None
-    """Whether ours agrees with the paper; None where the paper has nothing to compare with."""
+    """True if ours agrees with the paper; None where the paper has nothing to compare with."""
     as_scripts: bool | None = None
-    """Whether ours agrees with the scripts' runs; None where they have nothing to compare with."""
+    """True if ours agrees with the scripts' runs; None where they have nothing to compare with."""
 
     @property
     def beyond(self) -> bool:

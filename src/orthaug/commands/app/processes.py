@@ -52,7 +52,7 @@ class Command:
     code: int | None = None
     stopping: bool = False
     ending: bool = False
-    """Whether it was asked to end with the result reached so far."""
+    """True if it was asked to end with the result reached so far."""
     process: asyncio.subprocess.Process | None = None
 
     @property

@@ -71,7 +71,7 @@ class Session:
         self.refused = ""
         """Why the spec cannot be trained."""
         self.stale = False
-        """Whether `checked` is of an earlier spec: this one could not be opened."""
+        """True if `checked` is of an earlier spec: this one could not be opened."""
         self.checking = False
         self.commands: dict[str, Command] = {}
         self.trained: dict[str, str] = {}

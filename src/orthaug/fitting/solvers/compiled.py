@@ -67,7 +67,7 @@ class TrainingRun(NamedTuple):
     coefficients: np.ndarray | None = None
     """θ (nθ,) where the solver iterated on it too; None where it is eliminated."""
     held: bool = False
-    """Whether a penalty or a bound held the learner, so that `normal` has its rows too."""
+    """True if a penalty or a bound held the learner, so that `normal` has its rows too."""
     fixed: dict[int, float] | None = None
     """Entries of θ that stood at a bound, with its value."""
     tail: Tail | None = None

@@ -47,7 +47,7 @@ class CheckpointWriter(Protocol):
 
 @runtime_checkable
 class RunState(Protocol):
-    """What the driver reads of the state of a run."""
+    """Fields of a run's state that the driver reads."""
 
     @property
     def control(self) -> StepControl: ...
@@ -242,9 +242,9 @@ class _Iterate(NamedTuple):
     path: tuple[Vector, ...]
     first_loss: float
     begun: bool
-    """Whether evidence chooses the ridge by now."""
+    """True if evidence chooses the ridge by now."""
     coloured: bool = False
-    """Whether the colour of the errors counts. It does once they no longer fall fast; before,
+    """True if the colour of the errors counts. It does once they no longer fall fast; before,
     misfit colours them.
     """
 
