@@ -25,6 +25,9 @@ E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
+_FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
+_NAMED = 12  # parameters in a warning
+_LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
 _DETERMINED = re.compile(
     r"( The data determine | Of the physical parameters they determine )[^.]*\."
     r"|: the data determine [^.]*"
@@ -49,40 +52,90 @@ def doubt(made: E) -> E:
         None,
     )
     unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
+    left = _static_share(result) if unmodelled else 0.0
     known = {warning.code for warning in result.warnings}
     warnings: list[Warning] = list(failed)
     if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
         warnings.append(
-            Warning(code="unexplained", text=_unexplained_text(test, bool(result.residuals)))
+            Warning(
+                code="unexplained",
+                text=_unexplained_text(test, left, bool(result.residuals))
+                + _withdrawal(result, left),
+            )
         )
-    if test is not None and test.has_memory:
+    if test is not None and test.has_memory and left <= _LEFT:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test)
     if any(warning.code == "unexplained" for warning in found["warnings"]):
         found |= {
-            name: _noise_only(getattr(result, name))
+            name: _noise_only(getattr(result, name), withdrawn=left > _LEFT)
             for name in ("parameters", "physical_parameters")
         }
-    reason = _reason(result, test, unmodelled)
+    reason = _reason(result, test, left, unmodelled)
     if result.shared is not None and reason:
         found["shared"] = _withdraw(result.shared, reason)
     return replace(made, result=result.changed(**found))
 
 
-def _noise_only(rows: list[ParameterResult] | None) -> list[ParameterResult] | None:
-    """Return the parameters with their intervals marked as those of noise alone."""
+def _static_share(result: Findings) -> float:
+    """Return the share of the residual's variance that functions of the regressors still predict.
+
+    Causes that explain what the learner holds say nothing of what it does not hold; nor is memory
+    missing where a function of one row is.
+    """
+    shares = (
+        [one.functions for one in result.residuals.predictable or ()] if result.residuals else []
+    )
+    return max(shares, default=0.0)
+
+
+def _withdrawal(result: Findings, left: float) -> str:
+    """Return a sentence on the intervals with bias that are not given; empty for none."""
+    rows = [*(result.parameters or ()), *(result.physical_parameters or ())]
+    names = [row.name for row in rows if row.bias is not None]
+    if left <= _LEFT or not names:
+        return ""
+    return (
+        " The learner holds only a part of what the physics lacks, so no interval with its bias is "
+        f"given for {', '.join(names[:_NAMED])}"
+        + (f" and {len(names) - _NAMED} more." if len(names) > _NAMED else ".")
+    )
+
+
+def _noise_only(
+    rows: list[ParameterResult] | None, *, withdrawn: bool
+) -> list[ParameterResult] | None:
+    """Return the parameters with their intervals marked as those of noise alone.
+
+    `withdrawn` takes the intervals with bias away.
+    """
     if rows is None:
         return None
-    return [
+    found = [
         row.model_copy(update={"ci95_counts": "noise only"}) if row.ci95 is not None else row
         for row in rows
     ]
+    if not withdrawn:
+        return found
+    return [
+        row
+        if row.bias is None
+        else row.model_copy(
+            update={
+                "ci95_with_bias": None,
+                "bias": row.bias.model_copy(update={"determined": False}),
+            }
+        )
+        for row in found
+    ]
 
 
-def _unexplained_text(test: StructureTest | None, judged: bool) -> str:
-    if test is None or not test.found:
+def _unexplained_text(test: StructureTest | None, left: float, judged: bool) -> str:
+    if left > _LEFT:
+        what = f"the model's error contains more than noise: {_functions_text(left)}"
+    elif test is None or not test.found:
         what = "the residual contains more than noise"
         what += " (its verdict is `unmodelled`)" if judged else ""
     elif test.is_far:
@@ -106,6 +159,10 @@ def _unexplained_text(test: StructureTest | None, judged: bool) -> str:
         "parameters by more. Search for its terms with `[[suspects]]` or `orthaug explain`. "
         "Write them into the physics, or let the learner see what they depend on."
     )
+
+
+def _functions_text(left: float) -> str:
+    return f"functions of the regressors predict {percent(left)} of the residual's variance"
 
 
 def _hidden_state(fit: Any, test: StructureTest) -> str:
@@ -133,6 +190,8 @@ def _movement_text(fit: Any, best: FamilyTest) -> str:
     if not values:
         return ""
     now = _current_values(fit)
+    if any(abs(values[name]) > _FAR * abs(now[name]) > 0 for name in values):
+        return ""  # one linear step that far is no estimate
     moves = sorted(
         values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300)
     )
@@ -182,8 +241,10 @@ def memory_result(one: FamilyTest, parameters: dict[str, float] | None = None) -
     )
 
 
-def _reason(result: Findings, test: StructureTest | None, unmodelled: bool) -> str:
+def _reason(result: Findings, test: StructureTest | None, left: float, unmodelled: bool) -> str:
     """Return the reason why the fit determines no parameter; empty where it determines some."""
+    if left > _LEFT:
+        return _functions_text(left)
     if test is not None and test.found:
         best = max(
             (one for one in (test.static, test.memory) if one is not None),

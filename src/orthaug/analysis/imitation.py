@@ -29,6 +29,9 @@ _LAGS, _FEWEST_ROWS = 12, 60  # of each input, and rows on which they are tried
 _FOLLOWED = 1e-3
 _DISTINCT = 1e-6  # of a column's size: less of it beside others is rounding
 
+# What depends on anything else moves parameters, and no learner of these inputs takes it up
+_PROVIDED = ", if what the physics lacks depends only on that"
+
 
 @dataclass(frozen=True)
 class Alternative:
@@ -98,7 +101,7 @@ class Imitation:
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{text}: the data determine every{rest} parameter.{self._nearly}"
+            return f"{text}: the data determine every{rest} parameter{_PROVIDED}.{self._nearly}"
         could = _list_words([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
@@ -155,7 +158,7 @@ class MotionImitation(Imitation):
         if not self.directions:
             return (
                 f"{sees} and could imitate no change of a parameter: the data determine all of "
-                f"them.{self._remembered}"
+                f"them{_PROVIDED}.{self._remembered}"
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
         text = (

@@ -99,12 +99,27 @@ def sensitivities(
         return None
     to_next, value, to_output = _at_rows(form, numbers, x, u)
     with np.errstate(all="ignore"):
-        added = terms(points)(rows.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
-        columns = _propagate(to_next, to_output, added, equations, form)
+        of_rows = terms(points)
+        added, at_ends = (
+            of_rows(one.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
+            for one in (rows, _ends(rows, n0, form.motion.hold))
+        )
+        columns = _propagate(to_next, to_output, added, at_ends, equations, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():
         return None
     return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
+
+
+def _ends(rows: Matrix, n0: int, hold: str) -> Matrix:
+    """Return states and inputs (m, T, n) at the end of every sample.
+
+    An input that is held keeps its value until there, and jumps then.
+    """
+    ends = np.concatenate([rows[:, 1:], rows[:, -1:]], axis=1)
+    if hold == "zero-order":
+        ends = np.concatenate([ends[..., :n0], rows[..., n0:]], axis=2)
+    return ends
 
 
 def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
@@ -127,9 +142,17 @@ def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[An
 
 
 def _propagate(
-    to_next: Any, to_output: Any, added: Any, equations: Sequence[int], form: MotionDynamics
+    to_next: Any,
+    to_output: Any,
+    added: Any,
+    at_ends: Any,
+    equations: Sequence[int],
+    form: MotionDynamics,
 ) -> Any:
-    """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next."""
+    """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next.
+
+    The terms act by the trapezoidal rule: `added` at the begin of a sample, `at_ends` at its end.
+    """
     m, steps, n0, own = to_next.shape
     q, h = len(added), form.sampling_time
     columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
@@ -141,7 +164,7 @@ def _propagate(
         columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
         slope = a @ slope
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
-        now, then = added[:, :, k].T, added[:, :, min(k + 1, steps - 1)].T  # (m, q)
+        now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
         for place, i in enumerate(equations):
             to = slice(own + place * q, own + (place + 1) * q)
             if form.motion.scheme.discrete:

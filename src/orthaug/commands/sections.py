@@ -144,7 +144,10 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
     # every branch of a union has errors: the branch whose type fits was meant, and there the
     # deepest error counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
-    first = max(fitting or errors[:1], key=lambda e: len(e["loc"]))
+    # a misspelt key has two errors, the missing name and the unknown one: the latter says why
+    first = max(
+        fitting or errors[:1], key=lambda e: (len(e["loc"]), e["type"] == "extra_forbidden")
+    )
     key = _key(first["loc"], content)
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":

@@ -142,7 +142,7 @@ def _fine_enough(
     while (
         motion.substeps is None
         and not motion.scheme.discrete
-        and segmented.dynamics.substeps < MOST_SUBSTEPS
+        and 2 * segmented.dynamics.substeps <= MOST_SUBSTEPS
     ):
         finer = segmented.with_substeps(2 * segmented.dynamics.substeps)
         if substep_shift(segmented.physics_only, finer.physics_only, free_fit) <= _FINE:

@@ -1,0 +1,97 @@
+"""What a fit says of causes that it cannot know: found by trials on systems that no example has."""
+
+import numpy as np
+import pytest
+from test_cli import run
+
+import orthaug as oa
+from orthaug.analysis.missing_terms import missing_terms
+
+TS = 0.1
+
+
+def tanh_friction(rows: int = 800) -> oa.Record:
+    """y = 1.5 y₁ − 0.7 y₂ + u₁ + 0.6 tanh(2 (y₁ − y₂)) + e: no memory beside the lags."""
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(size=rows), np.zeros(rows)
+    for k in range(2, rows):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1]
+        y[k] += 0.6 * np.tanh(2 * (y[k - 1] - y[k - 2])) + 0.1 * rng.normal()
+    return oa.Record.from_arrays(u, y, sampling_time=TS)
+
+
+PHYSICS = [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+
+
+def test_a_learner_of_the_wrong_form_gives_no_interval_with_bias():
+    """It explains itself wholly, and nothing of what it cannot hold."""
+    learner = oa.Terms(terms=("(y[k-1]-y[k-2])**3",))
+    fit = oa.estimate(
+        tanh_friction(),
+        oa.Baseline.from_terms(PHYSICS),
+        learner=learner,
+        criterion=oa.Prediction(),
+    )
+    found = fit.diagnose()
+    codes = {warning.code: warning.text for warning in found.warnings}
+    assert "functions of the regressors predict" in codes["unexplained"]
+    assert "no interval with its bias is given for a1, a2, b" in codes["unexplained"]
+    assert "hidden_state" not in codes
+    for row in found.parameters:
+        assert row.ci95_counts == "noise only"
+        assert row.ci95_with_bias is None and not row.bias.determined
+
+
+def held_wrongly() -> tuple[oa.Record, oa.Motion]:
+    """A mass on a spring whose input runs straight between samples, declared as held."""
+    t = 0.2 * np.arange(500)
+    u = np.sin(1.3 * t) + 0.7 * np.sin(2.9 * t + 1) + 0.5 * np.sin(4.7 * t)
+    state, y = np.zeros(2), []
+    for k in range(500):
+        y.append(state[0])
+        if k == 499:
+            break
+        for i in range(40):
+            force = u[k] + (u[k + 1] - u[k]) * (i + 0.5) / 40
+            rate = np.array([state[1], (force - 0.8 * state[1] - 6 * state[0]) / 1.2])
+            middle = state + 0.0025 * rate
+            rate = np.array([middle[1], (force - 0.8 * middle[1] - 6 * middle[0]) / 1.2])
+            state = state + 0.005 * rate
+    noisy = np.array(y) + 1e-3 * np.random.default_rng(0).normal(size=500)
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - c*v - k*x)/m", start="derivative of y"),
+        ],
+        outputs=[oa.Output("y", "x")],
+        inputs=["u"],
+        parameters=[oa.PhysicalParameter(n, i, min=0) for n, i in (("m", 1), ("c", 1), ("k", 5))],
+    )
+    return oa.Record.from_arrays(u, noisy, sampling_time=0.2), motion
+
+
+def test_a_held_input_is_not_named_as_missing_where_the_physics_has_it():
+    """(u − c v − k x)/m + βu is the same family: βu can explain nothing."""
+    record, motion = held_wrongly()
+    test = missing_terms(oa.estimate(record, motion, learner=None))
+    assert test is not None
+    assert not any(term.variable == "u" and term.shape == "linear" for term in test.terms)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        (
+            "regressor",
+            "regresor",
+            "unknown key 'baseline.terms[0].regresor', did you mean 'regressor'",
+        ),
+        ("train", "trian", "unknown key 'data.trian', did you mean 'train'"),
+    ],
+)
+def test_a_misspelt_key_that_is_required_is_named(tmp_path, right, wrong, message):
+    spec = '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\ntrain = { files = ["a.csv"] }\n'
+    spec += '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    (tmp_path / "spec.toml").write_text(spec.replace(right, wrong))
+    done = run("check", tmp_path / "spec.toml")
+    assert done.code == 2 and message in done.err
