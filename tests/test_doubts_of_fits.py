@@ -5,7 +5,9 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
+from orthaug.analysis.input_timing import try_holds
 from orthaug.analysis.missing_terms import missing_terms
+from orthaug.physics.problem import MotionProblem
 
 TS = 0.1
 
@@ -95,3 +97,17 @@ def test_a_misspelt_key_that_is_required_is_named(tmp_path, right, wrong, messag
     (tmp_path / "spec.toml").write_text(spec.replace(right, wrong))
     done = run("check", tmp_path / "spec.toml")
     assert done.code == 2 and message in done.err
+
+
+def test_another_hold_is_not_advised_for_an_input_that_is_held():
+    """Quadratic drag is missing, and the force steps: a first-order hold would only fit better by chance."""
+    record, motion = held_wrongly()
+    assert "first-order" in {one.hold for one in holds_tried(record, motion)}
+    steps = np.repeat(record.experiments[0].inputs[::10], 10, axis=0)
+    held = oa.Record.from_arrays(steps, record.experiments[0].outputs, sampling_time=0.2)
+    assert [one.hold for one in holds_tried(held, motion)] == ["zero-order"]
+
+
+def holds_tried(record, motion):
+    problem = MotionProblem.of(record, motion)
+    return try_holds(problem, oa.Simulation(), oa.LevenbergMarquardt(), oa.Orthogonal()).holds

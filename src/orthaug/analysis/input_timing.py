@@ -20,6 +20,7 @@ from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.problem import MotionProblem
 
 ROWS = 4000  # at most
+_STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
 _LONGEST = 20  # rows of the record to one of delay
@@ -74,7 +75,8 @@ def try_holds(
 ) -> Trial:
     """Fit physics alone with the declared hold, and go on from there with every other.
 
-    One hold alone is tried where the motion is discrete or has no inputs.
+    One hold alone is tried where the motion is discrete or has no inputs, or where an input is
+    declared and recorded in steps: physics that lack something else may gain by another hold.
 
     Args:
         learner: what the trial's task has beside the physics; it is not trained.
@@ -83,11 +85,21 @@ def try_holds(
     motion, free_fit = problem.motion, task.physics
     found = [_declared_trial(task.plan, free_fit, declared=True)]
     several = not motion.scheme.discrete and bool(motion.driving) and free_fit is not None
+    if motion.hold == "zero-order" and _is_stepped(task.problem.record):
+        several = False
     for hold in HOLDS if several else ():
         if hold != motion.hold:
             found.append(_try_hold(hold, task, solver))
     substeps = None if free_fit is None else task.plan.dynamics.substeps
     return Trial(len(task.problem.record), substeps, tuple(found), task)
+
+
+def _is_stepped(record: Record) -> bool:
+    """Return whether an input keeps its value from most rows to the next, as a held one does."""
+    inputs = record.experiments[0].inputs
+    return bool(
+        len(inputs) > 1 and (np.mean(np.diff(inputs, axis=0) == 0, axis=0) > _STEPPED).any()
+    )
 
 
 def on_longest(
