@@ -7,7 +7,6 @@ from test_cli import run
 import orthaug as oa
 from orthaug.analysis.input_timing import try_holds
 from orthaug.analysis.missing_terms import missing_terms
-from orthaug.physics.problem import MotionProblem
 
 TS = 0.1
 
@@ -109,5 +108,5 @@ def test_another_hold_is_not_advised_for_an_input_that_is_held():
 
 
 def holds_tried(record, motion):
-    problem = MotionProblem.of(record, motion)
+    problem = oa.estimate(record, motion, learner=None).problem
     return try_holds(problem, oa.Simulation(), oa.LevenbergMarquardt(), oa.Orthogonal()).holds
