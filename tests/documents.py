@@ -195,7 +195,9 @@ class Page:
     def printed(self, block: Block) -> str:
         """Runs a block and returns what it printed; fails where a command ends otherwise than it should."""
         given.give(block.given, self.names)
-        if block.language == "toml" and block.title:
+        if block.language == "toml" and block.title == "pyproject.toml":
+            assert tomllib.loads(block.text)["project"]  # of another package
+        elif block.language == "toml" and block.title:
             Path(block.title).write_text(block.text, encoding="utf-8")
             orthaug.load_spec(Path(block.title))
         elif block.language == "toml":

@@ -263,7 +263,7 @@ def release_programs(share: float = _MOST_MAPS) -> bool:
     if "jax" not in sys.modules or not held.exists():
         return False
     try:
-        most = int(granted.read_text())
+        most = int(granted.read_bytes())
     except (OSError, ValueError):
         most = _MAPS
     if held.read_bytes().count(b"\n") <= share * most:
