@@ -586,8 +586,9 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            "no linear model follows the outputs over all held-out rows; orders are the best of "
-            f"runs that start again every {model.restarted} rows, with an error of {shown}"
+            f"orders are the best of runs that start again every {model.restarted} rows, with an "
+            f"error of {shown}, for longer ones drift on the last {percent(1 - FITTED)} of rows 0 "
+            f"to {cut}"
         )
     if cut - missing > LOOKED_AT:
         lines.append(
