@@ -266,11 +266,17 @@ def look(path: Path) -> Survey:
 
 
 def assign(
-    found: Survey, inputs: Names | None, outputs: Names | None, sampling_time: float | None = None
+    found: Survey,
+    inputs: Names | None,
+    outputs: Names | None,
+    sampling_time: float | None = None,
+    *,
+    guess: bool = True,
 ) -> Roles | None:
     """Return the columns by name; where none are given, by the meaning of their names.
 
-    Where the names leave that open, by what predicts what in the data; None if that is open, too.
+    Where the names leave that open, by what predicts what in the data; None if that is
+    open, too, or no `guess` is wanted.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -279,10 +285,10 @@ def assign(
         known = found.roles()
         if known is not None:
             return Roles(tuple(known[0]), tuple(known[1]), sampling_time)
-        guess = None if found.contradicted else guess_roles(found.signals)
-        if guess is None:
+        guessed = guess_roles(found.signals) if guess and not found.contradicted else None
+        if guessed is None:
             return None
-        return Roles(guess.inputs, guess.outputs, sampling_time, str(guess))
+        return Roles(guessed.inputs, guessed.outputs, sampling_time, str(guessed))
     named = {"input": inputs, "output": outputs}
     chosen = [
         None if n is None else columns_of(found, n, kind, sampling_time)

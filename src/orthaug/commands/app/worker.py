@@ -111,7 +111,8 @@ def look(
         "open": "",
     }
     try:
-        roles = starting.assign(found, inputs, outputs, None if step is None else check_step(step))
+        given = None if step is None else check_step(step)
+        roles = starting.assign(found, inputs, outputs, given, guess=False)  # the page asks
         if roles is not None:
             draft = starting.draft(found, roles, Path(out))
             names = {
