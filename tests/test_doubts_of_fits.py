@@ -38,6 +38,7 @@ def test_a_learner_of_the_wrong_form_gives_no_interval_with_bias():
     assert "functions of the regressors predict" in codes["unexplained"]
     assert "no interval with its bias is given for a1, a2, b" in codes["unexplained"]
     assert "hidden_state" not in codes
+    assert found.unexplained is None or not found.unexplained.hidden_state
     for row in found.parameters:
         assert row.ci95_counts == "noise only"
         assert row.ci95_with_bias is None and not row.bias.determined

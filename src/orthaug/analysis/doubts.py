@@ -63,11 +63,12 @@ def doubt(made: E) -> E:
                 + _withdrawal(result, left),
             )
         )
-    if test is not None and test.has_memory and left <= _LEFT:
+    hidden = test is not None and test.has_memory and left <= _LEFT
+    if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
-        found["unexplained"] = _structure(fit, test)
+        found["unexplained"] = _structure(fit, test, hidden=hidden)
     if any(warning.code == "unexplained" for warning in found["warnings"]):
         found |= {
             name: _noise_only(getattr(result, name), withdrawn=left > _LEFT)
@@ -217,10 +218,10 @@ def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
     }
 
 
-def _structure(fit: Any, test: StructureTest) -> StructureResult:
+def _structure(fit: Any, test: StructureTest, *, hidden: bool) -> StructureResult:
     sure = [one for one in test.families if one.sure]
     return StructureResult(
-        hidden_state=test.has_memory,
+        hidden_state=hidden,
         static=None if test.static is None else memory_result(test.static),
         memory=[memory_result(one, _values_with(fit, one)) for one in sure],
     )

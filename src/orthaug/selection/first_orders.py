@@ -93,15 +93,17 @@ def _telling(
     whole = _best_choice(record, excited, first_lags, None)
     if whole is None or not record.inputs or (whole[0] < _TELLING and whole[1].na):
         return whole, None
-    static, found = whole[0] < _TELLING, whole
+    static = whole[0] < _TELLING
+    best: tuple[_Choice, int | None] = (whole, None)
     for length in _RESTARTED[:2] if static else _RESTARTED:
         tried = _best_choice(record, excited, first_lags, length)
         if tried is None:
             break
-        found = tried
-        if found[0] < (_DYNAMIC * whole[0] if static else _TELLING):
-            return found, length
-    return (whole, None) if static else (found, None if found is whole else length)
+        if tried[0] < (_DYNAMIC * whole[0] if static else _TELLING):
+            return tried, length
+        if not static:
+            best = tried, length
+    return best
 
 
 def _best_choice(

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import scipy.special
+from scipy.sparse.csgraph import connected_components
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.columns import Column
@@ -27,11 +29,10 @@ _NOTHING = 0.1  # of that of the least certain output, from which on a column is
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Columns that the others do not predict, those that they do, and those without a relation."""
+    """Columns that predict others and are not predicted, and those that are."""
 
     inputs: tuple[Column, ...]
     outputs: tuple[Column, ...]
-    unrelated: tuple[Column, ...]
 
     def __str__(self) -> str:
         """Return the reason, as a sentence."""
@@ -59,36 +60,21 @@ def guess_roles(columns: Sequence[Column]) -> Guess | None:
     if not 0 < len(follow) <= _MOST_OUTPUTS:
         return None
     least = min(tests[i][0] for i in follow)
-    lead = [i for i, (gain, p) in enumerate(tests) if i not in follow and _is_free(gain, p, least)]
-    if len(lead) + len(follow) < len(columns):
+    lead = [i for i in range(len(columns)) if i not in follow]
+    if any(p <= _UNSURE and gain >= _NOTHING * least for gain, p in (tests[i] for i in lead)):
         return None
-    driving = [i for i in lead if any(lags.drives(i, j) for j in follow)]
+    drives = np.zeros((len(columns), len(columns)), dtype=bool)
+    for i, j in product(range(len(columns)), follow):
+        drives[i, j] = i != j and lags.drives(i, j)
+    driving = [i for i in lead if drives[i].any()]
     if not driving or any(columns[i].kind == "output" for i in driving):
         return None
     if any(columns[i].kind == "input" for i in follow):
         return None
-    if not _connected(lags, driving, follow):
+    related = np.ix_([*driving, *follow], [*driving, *follow])
+    if connected_components(drives[related], directed=False, return_labels=False) > 1:
         return None
-    return Guess(
-        tuple(columns[i] for i in driving),
-        tuple(columns[i] for i in follow),
-        tuple(columns[i] for i in lead if i not in driving),
-    )
-
-
-def _connected(lags: _Lags, driving: list[int], follow: list[int]) -> bool:
-    """Return whether every column is related to every other, directly or through others."""
-    links = [(i, j) for i in (*driving, *follow) for j in follow if i != j and lags.drives(i, j)]
-    reached = {driving[0]}
-    for _ in (*driving, *follow):
-        for pair in links:
-            if reached & set(pair):
-                reached |= set(pair)
-    return reached == {*driving, *follow}
-
-
-def _is_free(gain: float, p: float, least: float) -> bool:
-    return p > _UNSURE or gain < _NOTHING * least
+    return Guess(tuple(columns[i] for i in driving), tuple(columns[i] for i in follow))
 
 
 @dataclass(frozen=True, eq=False)
