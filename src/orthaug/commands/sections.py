@@ -145,9 +145,7 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
     # deepest error counts
     fitting = [e for e in errors if not e["type"].endswith("_type")]
     # a misspelt key has two errors, the missing name and the unknown one: the latter says why
-    first = max(
-        fitting or errors[:1], key=lambda e: (len(e["loc"]), e["type"] == "extra_forbidden")
-    )
+    first = max(fitting or errors[:1], key=lambda e: (len(e["loc"]), e["type"] != "missing"))
     key = _key(first["loc"], content)
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
