@@ -435,6 +435,24 @@ def test_an_input_that_acts_late_is_named_with_its_delay(samples: int) -> None:
     assert all('channel = "u", samples = 5.' in text for text in texts)
 
 
+def test_an_input_that_acts_through_a_lag_is_named_with_its_time_constant() -> None:
+    """A delay explains much of it too, and would be the wrong remedy."""
+    record = data()
+    (e,) = record.experiments
+    x, y = 0.0, []
+    for value in e.outputs[:, 0]:  # a sensor with a time constant of ten samples
+        x += (value - x) * (1 - np.exp(-0.1))
+        y.append(x)
+    record = oa.Record.from_arrays(u=e.inputs[:, 0], y=y, sampling_time=TS)
+    found = oa.diagnose(oa.estimate(record, spring(), learner=None, criterion=WHOLE))
+    assert found is not None
+    warnings = dict((warning.code, warning.text) for warning in found.warnings)
+    assert "dead_time" not in warnings and "u seems to act through a lag" in warnings["slow_input"]
+    assert "Most likely u acts through a lag: with a first-order lag of" in found.text
+    time_constant = float(found.text.split("first-order lag of ")[1].split(" s")[0])
+    assert 0.5 * 10 * TS < time_constant < 2 * 10 * TS
+
+
 @pytest.mark.parametrize(
     ("own", "words"), [(0.0, "too little to predict it from its"), (0.2, "and 20 % of it follows")]
 )

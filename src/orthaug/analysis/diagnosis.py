@@ -25,7 +25,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
-from orthaug.analysis.input_timing import DeadTime, dead_times, on_longest
+from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
@@ -165,7 +165,7 @@ def _of_motion(
     white = all(test.practically_white() for test in tests)
     size = rms_errors(free_run) / fit.problem.deviation
     late = (
-        _dead_times(fit)
+        _late_inputs(fit)
         if motion.inputs and (explained or not white) and np.any(size > _SIZABLE)
         else ()
     )
@@ -182,7 +182,7 @@ def _of_motion(
     return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
 
 
-def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
+def _late_inputs(fit: MotionEstimate) -> tuple[LateInput, ...]:
     """Return the inputs that act later, by the physics trained before the learner.
 
     It runs in the same compiled programs.
@@ -190,7 +190,7 @@ def _dead_times(fit: MotionEstimate) -> tuple[DeadTime, ...]:
     solver, posed = LevenbergMarquardt().within_limit, fit.problem
     posed = posed if fit.learns else posed.without_learner()
     learner = fit.model.form.bound.learner
-    return dead_times(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
+    return find_late_inputs(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
 def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:

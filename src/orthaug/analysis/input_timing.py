@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.memory import MemoryTerm
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.motion_task import MotionTask
@@ -178,43 +180,64 @@ def _declared_trial(
 
 
 @dataclass(frozen=True)
-class DeadTime:
-    """An input that acts `samples` later, with the residuals of the physics with and without it.
+class LateInput:
+    """An input that acts later than in the equations: by a delay, or through a first-order lag.
 
-    Residuals are in deviations of the outputs.
+    The residuals of the physics with the best of each, and as declared, are in deviations of the
+    outputs. A lag's time constant is in samples.
     """
 
     input: str
-    samples: int
-    residual: float
-    undelayed: float
+    sampling_time: float
+    delay: int
+    delayed: float
+    lag: int
+    lagged: float
+    declared: float
+
+    @property
+    def by_lag(self) -> bool:
+        """Whether a lag explains the data better than a delay."""
+        return self.lagged < self.delayed
 
     @property
     def gain(self) -> str:
-        """Gain by the delay, in words."""
-        late = f"{self.samples} sample{'s' * (self.samples > 1)}"
+        """Gain by the better one, beside the other, in words."""
+        late = f"a delay of {self.delay} sample{'s' * (self.delay > 1)}"
+        slow = f"a first-order lag of {self.lag * self.sampling_time:.3g} s"
+        pairs = [(slow, self.lagged), (late, self.delayed)]
+        (better, least), (other, more) = pairs if self.by_lag else pairs[::-1]
         return (
-            f"with a delay of {late} the error of physics alone is {self.residual:.3g} "
-            f"standard deviations of the output instead of {self.undelayed:.3g}"
+            f"with {better} the error of physics alone is {least:.3g} standard deviations of the "
+            f"output instead of {self.declared:.3g} ({more:.3g} with {other})"
         )
 
     @property
     def warning(self) -> Warning:
         """With what to write into the spec."""
+        if self.by_lag:
+            return Warning(
+                "slow_input",
+                f"{self.input} seems to act through a lag: {self.gain}, with other parameters. A "
+                "drive, a filter or a sensor may be slow: give it a state of its own, whose "
+                "derivative is (what goes in − the state)/T with T as a parameter.",
+            )
         return Warning(
             "dead_time",
             f"{self.input} seems to act late: {self.gain}, with other parameters. If there is "
             'a dead time, delay the input by [[data.prepare]] with step = "shift", channel = '
-            f'"{self.input}", samples = {self.samples}. If its drive is slow, model the drive '
+            f'"{self.input}", samples = {self.delay}. If a drive or a sensor is slow, model it '
             "in the equations.",
         )
 
 
-def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
-    """Return the inputs that act clearly later than in the equations, and by how many samples.
+def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
+    """Return the inputs that act clearly later than in the equations, and by how much.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
-    by what lies between; physics alone is refitted each time from where the last one ended.
+    by what lies between; where a delay helps, a lag's time constant is sought in the same way.
+    Physics alone is refitted each time from where the nearest one ended. A lag of the input acts
+    on linear physics as one of every sensor.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -222,37 +245,64 @@ def dead_times(task: MotionTask, solver: Any) -> tuple[DeadTime, ...]:
     if task.physics is None:
         return ()
     found, most = [], len(task.problem.record) // _LONGEST
+    sampling_time = task.problem.record.sampling_time
+    declared = residual_of(task.plan, task.physics)
     for number, name in enumerate(task.problem.motion.external):
-        delays = _Delays(
-            task, solver, number, {0: (residual_of(task.plan, task.physics), task.physics)}
+        delays, lags = (
+            _LateFits(task, solver, number, change, {0: (declared, task.physics)})
+            for change in (_delay, _lag)
         )
         best = _lowest_argument(delays.leaves, most)
-        if delays.leaves(best) < (1 - _LATE) * delays.leaves(0):
-            found.append(DeadTime(name, best, delays.leaves(best), delays.leaves(0)))
+        if delays.leaves(best) < (1 - _LATE) * declared:
+            slow = _lowest_argument(lags.leaves, most)
+            found.append(
+                LateInput(
+                    name,
+                    sampling_time,
+                    best,
+                    delays.leaves(best),
+                    slow,
+                    lags.leaves(slow),
+                    declared,
+                )
+            )
     return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
-class _Delays:
-    """Physics alone with one input delayed, refitted from the nearest delay that was tried."""
+class _LateFits:
+    """Physics alone with one input changed, refitted from the nearest size that was tried."""
 
     task: MotionTask
     solver: Any
     number: int
+    change: Callable[[Vector, int], Vector]
+    """Of an input's values, by so many samples."""
     tried: dict[int, tuple[float, FreeRunFit]]
-    """What each delay leaves, and where it ended; none is there from the start."""
+    """What each size leaves, and where it ended; none is there from the start."""
 
     def leaves(self, samples: int) -> float:
-        """Return the residual of the physics with the input so many samples later."""
+        """Return the residual of the physics with the input changed by so many samples."""
         if samples not in self.tried:
             near = self.tried[
                 min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
             ][1]
             problem = self.task.problem
-            late = _delay_input(problem.record, self.number, samples)
+            late = self._late(problem.record, samples)
             segmented, free_fit = refit_physics(self.task, near, problem.motion, late, self.solver)
             self.tried[samples] = residual_of(segmented, free_fit), free_fit or self.tried[0][1]
         return self.tried[samples][0]
+
+    def _late(self, record: Record, samples: int) -> Record:
+        """Return the record with the input changed in every experiment."""
+
+        def late(inputs: np.ndarray) -> np.ndarray:
+            column = self.change(inputs[:, self.number], samples)
+            return np.where(np.arange(inputs.shape[1]) == self.number, column[:, None], inputs)
+
+        return replace(
+            record, experiments=tuple(replace(e, inputs=late(e.inputs)) for e in record.experiments)
+        )
 
 
 def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
@@ -267,19 +317,12 @@ def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
     return best
 
 
-def _delay_input(record: Record, number: int, samples: int) -> Record:
-    """Return an input later by so many samples.
+def _delay(values: Vector, samples: int) -> Vector:
+    """Return an input later by so many samples; before the record it has its first value."""
+    first = np.full(min(samples, len(values)), values[0])
+    return np.concatenate([first, values])[: len(values)]
 
-    Before the record it has its first value.
-    """
 
-    def shift(inputs: np.ndarray) -> np.ndarray:
-        column = inputs[:, number]
-        late = np.concatenate([np.full(min(samples, len(column)), column[0]), column])[
-            : len(column)
-        ]
-        return np.where(np.arange(inputs.shape[1]) == number, late[:, None], inputs)
-
-    return replace(
-        record, experiments=tuple(replace(e, inputs=shift(e.inputs)) for e in record.experiments)
-    )
+def _lag(values: Vector, samples: int) -> Vector:
+    """Return an input behind a first-order lag whose time constant is so many samples."""
+    return MemoryTerm("lag", "input", float(samples)).along(values, 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
-from orthaug.analysis.input_timing import DeadTime
+from orthaug.analysis.input_timing import LateInput
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import ResidualTest
@@ -400,7 +400,7 @@ def free_run_words(
     followed: dict,
     curved: dict,
     lacks: MissingTest | None,
-    late: tuple[DeadTime, ...],
+    late: tuple[LateInput, ...],
 ) -> str:
     """Return the verdict on a motion's free run in words, with its reason."""
     units = {c.name: c.unit for c in fit.problem.record.outputs}
@@ -427,7 +427,9 @@ def free_run_words(
     if late:
         return (
             f"{subject} ({sizes}) contains more than noise. Most likely "
-            f"{late[0].input} acts later than in the equations: {late[0].gain}."
+            f"{late[0].input} acts "
+            f"{'through a lag' if late[0].by_lag else 'later than in the equations'}: "
+            f"{late[0].gain}."
         )
     if lacks is not None:
         return f"{subject} ({sizes}) contains more than noise. {_name_terms(lacks)}"

@@ -167,7 +167,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         from orthaug.analysis.absorbed import Waves
         from orthaug.analysis.imitation import imitation_before
-        from orthaug.analysis.input_timing import dead_times, try_holds
+        from orthaug.analysis.input_timing import find_late_inputs, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
         from orthaug.fitting.segmented_motion import SegmentedMotion
         from orthaug.inference.nearly_shared import shared_warnings
@@ -203,7 +203,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
         trial = try_holds(posed, criterion, spec.declared_solver(), structure, waves)
         text, warnings = _about_steps(problem, trial)
-        warnings += [late.warning for late in dead_times(trial.task, spec.declared_solver())]
+        warnings += [late.warning for late in find_late_inputs(trial.task, spec.declared_solver())]
         if identification.by_any is None:
             warnings.append(_NOT_RICH)
         found = {
