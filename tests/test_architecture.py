@@ -65,7 +65,6 @@ CONCEPTS = {
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",
-    "analysis.motion_identifiability": "identifiability before training",
     "analysis.observer": "the verb `observe`",
     "analysis.output_response": "a free run linearised, for any dynamics",
     "analysis.plant": "systems simulated for many inputs side by side",

@@ -111,3 +111,82 @@ def test_another_hold_is_not_advised_for_an_input_that_is_held():
 def holds_tried(record, motion):
     problem = oa.estimate(record, motion, learner=None).problem
     return try_holds(problem, oa.Simulation(), oa.LevenbergMarquardt(), oa.Orthogonal()).holds
+
+
+def two_lags(outputs: int) -> tuple[oa.Record, oa.Motion]:
+    """Two lags in series, of 0.3 s and 1.5 s, of which the last or both are measured."""
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.uniform(-5, 5, 40), 15)
+    first, last, y = 0.0, 0.0, []
+    for value in u:
+        y.append((last, first)[:outputs])
+        for _ in range(20):
+            first, last = (
+                first + 0.005 * (value - first) / 0.3,
+                last + 0.005 * (3 * first - last) / 1.5,
+            )
+    noisy = np.array(y) + 0.02 * rng.normal(size=(len(u), outputs))
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("x", "(K*v - x)/T2", start="y"),
+            oa.State("v", "(u - v)/T1", start="z" if outputs == 2 else 0.0),
+        ],
+        outputs=[oa.Output("y", "x"), oa.Output("z", "v")][:outputs],
+        inputs=["u"],
+        parameters=[
+            oa.PhysicalParameter(n, i, min=0) for n, i in (("K", 2), ("T1", 0.2), ("T2", 1))
+        ],
+    )
+    names = ["y", "z"][:outputs]
+    record = oa.Record.from_arrays(u, noisy, sampling_time=0.1, inputs=["u"], outputs=names)
+    return record, motion
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_time_constants_that_may_change_places_are_named(outputs):
+    """Only where the state between them is not measured."""
+    record, motion = two_lags(outputs)
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    texts = [w.text for w in found.warnings if w.code == "several_solutions"]
+    if outputs == 2:
+        assert not texts
+    else:
+        (text,) = texts
+        values = dict(
+            part.split(" = ") for part in text.split("with ")[1].split(". ")[0].split(", ")
+        )
+        assert float(values["T1"]) == pytest.approx(1.5, rel=0.05)
+        assert float(values["T2"]) == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize("k", [90.0, 9.5])
+def test_initial_values_that_lead_nowhere_are_replaced(k):
+    """A spring whose stiffness starts ten times too high follows another frequency."""
+    t = 0.05 * np.arange(1200)
+    force = np.where(t < 1, 5.0, 0.0)
+    noisy = ringing(force) + 1e-3 * np.random.default_rng(1).normal(size=len(t))
+    motion = oa.Motion.from_equations(
+        states=[oa.State("x", "v", start=0.0), oa.State("v", "u - c*v - k*x", start=0.0)],
+        outputs=[oa.Output("y", "x")],
+        inputs=["u"],
+        parameters=[
+            oa.PhysicalParameter("c", 0.05, min=0),
+            oa.PhysicalParameter("k", k, min=0),
+        ],
+    )
+    record = oa.Record.from_arrays(force, noisy, sampling_time=0.05)
+    fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation())
+    np.testing.assert_allclose(fit.values, [0.05, 9], rtol=0.02)
+    texts = [w.text for w in fit.diagnose().warnings if w.code == "other_start"]
+    assert len(texts) == (k == 90) and all("the fit begins there" in text for text in texts)
+
+
+def ringing(force):
+    """A mass of 1 kg on a spring of 9 N/m that hardly loses energy."""
+    x, v, y = 0.0, 0.0, []
+    for u in force:
+        y.append(x)
+        for _ in range(50):
+            v += 0.001 * (u - 0.05 * v - 9 * x)
+            x += 0.001 * v
+    return np.array(y)

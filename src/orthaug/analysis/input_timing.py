@@ -219,8 +219,8 @@ class LateInput:
             return Warning(
                 "slow_input",
                 f"{self.input} seems to act through a lag: {self.gain}, with other parameters. A "
-                "drive, a filter or a sensor may be slow: give it a state of its own, whose "
-                "derivative is (what goes in − the state)/T with T as a parameter.",
+                "drive, a filter or a sensor may be slow. Give it a state of its own: its "
+                "derivative is (what goes in − the state)/T, with T as a parameter.",
             )
         return Warning(
             "dead_time",

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from orthaug._base.checks import Vector
 
@@ -50,6 +49,8 @@ class MemoryTerm:
         `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
         """
         if self.kind == "lag":
+            from scipy.signal import lfilter  # slow to import, and few fits need it
+
             pole = float(np.exp(-sampling_time / self.scale))
             return lfilter([0.0, 1 - pole], [1.0, -pole], values, zi=[values[0]])[0]
         width, state = self.scale, 0.0

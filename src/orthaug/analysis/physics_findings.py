@@ -23,10 +23,12 @@ from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.analysis.motion_response import substep_bias
+from orthaug.analysis.other_solutions import find_other_solution
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.inference.measures import WeighedPhysics, weigh_problem
 from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.models.learners import learns
@@ -237,6 +239,13 @@ def _of_motion(
             "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
         )
         found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+    if fit.alone is not None and not fit.model.coloured:
+        alone, solver = fit.alone, LevenbergMarquardt().within_limit
+        attempt_warned(
+            "the search for other solutions",
+            lambda: find_other_solution(fit.segmented, solver, alone),
+            warnings,
+        )
     coarse = attempt_warned("the analysis of the substeps", lambda: substep_bias(fit), warnings)
     found["motion"] = describe_physics(fit)["motion"] | {
         "parts": parts or (),

@@ -169,6 +169,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.analysis.imitation import imitation_before
         from orthaug.analysis.input_timing import find_late_inputs, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
+        from orthaug.analysis.other_solutions import find_other_solution
+        from orthaug.fitting.motion_task import restart_warnings
         from orthaug.fitting.segmented_motion import SegmentedMotion
         from orthaug.inference.nearly_shared import shared_warnings
         from orthaug.inference.splitting import shared_of_motion
@@ -176,6 +178,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.models.moving import MotionDynamics
 
         problem, spec = job.problem, job.spec
+        solver: Any = spec.declared_solver()
         motion, criterion, structure = problem.motion, spec.declared_criterion(), job.structure
         segmented = SegmentedMotion.of(problem.without_learner(), nothing_learned(), criterion)
         identification = identify_ranks(segmented)
@@ -201,9 +204,14 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             seen = [str(entry) for entry in form.features]
             on_rows = shared_warnings(shared_of_motion(form, *run), seen)
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
-        trial = try_holds(posed, criterion, spec.declared_solver(), structure, waves)
+        trial = try_holds(posed, criterion, solver, structure, waves)
         text, warnings = _about_steps(problem, trial)
-        warnings += [late.warning for late in find_late_inputs(trial.task, spec.declared_solver())]
+        warnings += [late.warning for late in find_late_inputs(trial.task, solver)]
+        if trial.task.physics is not None:
+            q = trial.task.physics.end.point.theta
+            other = find_other_solution(trial.task.plan, solver, q)
+            warnings += other.warnings if other else ()
+            warnings += restart_warnings(trial.task.physics)
         if identification.by_any is None:
             warnings.append(_NOT_RICH)
         found = {

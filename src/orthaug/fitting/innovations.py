@@ -28,7 +28,12 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.conclusion import conclude_motion
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.motion_estimate import MotionEstimate
-from orthaug.fitting.motion_task import MotionTask, descend_from, train_motion_physics
+from orthaug.fitting.motion_task import (
+    MotionTask,
+    descend_from,
+    restart_warnings,
+    train_motion_physics,
+)
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
@@ -120,6 +125,7 @@ class InnovationsTask(MotionTask):
             found = found._replace(
                 iterations=begun.iterations + found.iterations,
                 seconds=begun.seconds + found.seconds,
+                restarted=begun.restarted,
             )
         return plan, found
 
@@ -131,6 +137,7 @@ class InnovationsTask(MotionTask):
         plan, learned = self._with_gain(learned)
         own = None if alone is None else alone[: len(plan.problem.names)]
         fit = conclude_motion(plan, structure, learned, own, briefly=briefly)
+        fit = replace(fit, warnings=(*fit.warnings, *restart_warnings(self.physics)))
         if briefly or not learned.ending.usable or learned.coefficients is None:
             return fit
         doubts = check_predictor(plan, learned.coefficients, learned.weights, fit.states)

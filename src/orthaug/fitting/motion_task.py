@@ -8,12 +8,14 @@ begin anew from the initial parameters.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.conclusion import conclude_motion
@@ -35,6 +37,7 @@ from orthaug.models.rows import Engine
 from orthaug.models.settling import LOOSE
 from orthaug.models.terms import scaling_of
 from orthaug.physics.motion import MOST_SUBSTEPS
+from orthaug.physics.parameters import Coordinates
 from orthaug.physics.problem import MotionProblem
 
 _SHORTEST = 15  # steps of a segment
@@ -44,6 +47,10 @@ _POOR = 0.5  # of the output's deviation: what is left above it may not be the b
 _SHORT_ITERATIONS = 15  # over segments that are not the last
 # Steps at most by which starts follow the outputs: a descent damps no step of theirs
 _SETTLING = 200
+_STARTS = 8  # drawn, where the declared initial values lead nowhere
+_WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
+RESTART_ITERATIONS = 30  # from each
+_SEED = 20_261_127
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 _LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
@@ -53,9 +60,85 @@ def train_motion_physics(
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Return parameters of physics alone, and segments that start at its states.
 
-    None where no run is finite.
+    Where it does not follow the outputs from the declared initial values, others are drawn, and
+    the best end is taken if it halves the error. None where no run is finite.
     """
-    own, initial = segmented.physics_only, segmented.problem.motion.coordinates.initial
+    own, coordinates = segmented.physics_only, segmented.problem.motion.coordinates
+    best = descend_by_lengths(own, solver, coordinates.initial, progress)
+    if best is None or not _follows(own, best):
+        best = _descend_from_others(own, solver, best)
+    if best is None:
+        return segmented, None
+    spent = {"iterations": best.iterations, "seconds": best.seconds}
+    segmented, best = _fine_enough(segmented, best, solver)
+    point = best.end.point
+    states = np.asarray(point.states)
+    x, _ = segmented.physics_only.trajectory(point.theta, (), states)
+    size = np.abs(x).max(axis=0, initial=0.0)
+    segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
+    mean_square = segmented.physics_only.mean_square(point.theta, ())
+    return segmented, best._replace(mean_square=mean_square, **spent)
+
+
+def draw_starts(coordinates: Coordinates, middles: Sequence[Vector]) -> Iterator[Vector]:
+    """Return the starts (np,) of further descents, around each of `middles` in turn."""
+    random = np.random.default_rng(_SEED)
+    low, high = coordinates.bounds
+    for number in range(_STARTS):
+        middle = middles[number % len(middles)]
+        size = np.where(coordinates.positive, _WIDE, np.where(middle, 2 * np.abs(middle), 1.0))
+        yield np.clip(middle + size * random.normal(size=len(middle)), low, high)
+
+
+def _descend_from_others(
+    own: SegmentedMotion, solver: LevenbergMarquardt, declared: FreeRunFit | None
+) -> FreeRunFit | None:
+    """Return the best end from drawn starts if it halves the declared one's error, else that."""
+    coordinates, best = own.problem.motion.coordinates, declared
+    middles = [coordinates.initial]
+    if declared is not None:
+        middles.append(declared.end.point.theta)
+    with np.errstate(all="ignore"):
+        for start in draw_starts(coordinates, middles):
+            other = descend_by_lengths(own, solver.at_most(RESTART_ITERATIONS), start)
+            if other is not None and (
+                best is None or other.end.point.misfit < best.end.point.misfit
+            ):
+                best = other
+    if best is None:
+        return None
+    after = float(np.sqrt(_squared_errors(own, best) / own.residuals))
+    if declared is None:
+        return best._replace(restarted=(None, after))
+    before = float(np.sqrt(_squared_errors(own, declared) / own.residuals))
+    return best._replace(restarted=(before, after)) if after < before / 2 else declared
+
+
+def restart_warnings(physics: FreeRunFit | None) -> tuple[Warning, ...]:
+    """Return a warning where the declared initial values of physics alone were given up."""
+    if physics is None or physics.restarted is None:
+        return ()
+    before, after = physics.restarted
+    error = "no run of it is finite" if before is None else f"its error is {before:.3g}"
+    text = (
+        f"from the declared initial values physics alone does not follow the data: {error}. From "
+        f"others its error is {after:.3g} standard deviations of the output: the fit begins there. "
+        "If its values are impossible, give bounds."
+    )
+    return (Warning("other_start", text),)
+
+
+def descend_by_lengths(
+    own: SegmentedMotion,
+    solver: LevenbergMarquardt,
+    initial: Vector,
+    progress: RunProgress = quiet,
+) -> FreeRunFit | None:
+    """Return the end of descents over ever longer segments, with what all of them spent.
+
+    Where that follows the outputs badly, a descent over whole segments from `initial` may end
+    lower. None where no run is finite.
+    """
     steps = own.segments.steps
     lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
     ends: list[FreeRunFit] = []
@@ -78,16 +161,9 @@ def train_motion_physics(
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
     if not ends:
-        return segmented, None
+        return None
     best = min(ends, key=lambda end: end.end.point.misfit)
-    segmented, best = _fine_enough(segmented, best, solver)
-    point = best.end.point
-    states = np.asarray(point.states)
-    x, _ = segmented.physics_only.trajectory(point.theta, (), states)
-    size = np.abs(x).max(axis=0, initial=0.0)
-    segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
-    mean_square = segmented.physics_only.mean_square(point.theta, ())
-    return segmented, best._replace(mean_square=mean_square, iterations=iterations, seconds=seconds)
+    return best._replace(iterations=iterations, seconds=seconds)
 
 
 def descend_from(
@@ -285,7 +361,8 @@ class MotionTask(SimulationTask):
     ) -> MotionEstimate:
         """Return the estimate of what a run learned."""
         alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
-        return conclude_motion(self.plan, structure, learned, alone, briefly=briefly)
+        fit = conclude_motion(self.plan, structure, learned, alone, briefly=briefly)
+        return replace(fit, warnings=(*fit.warnings, *restart_warnings(self.physics)))
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress

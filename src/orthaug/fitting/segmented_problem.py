@@ -38,6 +38,9 @@ class FreeRunFit(NamedTuple):
     mean_square: float
     iterations: int
     seconds: float
+    restarted: tuple[float | None, float] | None = None
+    """Errors in deviations of the outputs, from the declared initial values (None without a run)
+    and from those drawn instead; None where the declared ones were kept."""
 
     @property
     def ending(self) -> Ending:

@@ -1,0 +1,116 @@
+"""Other values of a motion's parameters that explain the data as well, or better.
+
+Physics alone is trained from random initial values around those that it was fitted with. Two time
+constants in series may change places without a trace in the output; a fit may have ended in a local
+minimum. No standard error shows either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
+from orthaug.analysis.input_timing import residual_of
+from orthaug.analysis.motion_identifiability import information
+from orthaug.fitting.motion_task import (
+    RESTART_ITERATIONS,
+    descend_by_lengths,
+    descend_from,
+    draw_starts,
+)
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.segmented_problem import FreeRunFit
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
+
+_AS_GOOD = 1e-3  # of the residual: as good
+_BETTER = 0.02  # of the residual: clearly better
+_APART = 10.0  # standard errors by the curvature of the fit: another minimum, not a flat one
+_MOST_ROWS = 20_000  # above, the training from every start takes too long
+
+
+@dataclass(frozen=True)
+class OtherSolution:
+    """Parameters of physics alone from another start, with its residual and that of the fit.
+
+    Residuals are in deviations of the outputs.
+    """
+
+    parameters: dict[str, float]
+    residual: float
+    fitted: float
+
+    @property
+    def better(self) -> bool:
+        """Whether it explains the data clearly better than the fit."""
+        return self.residual < (1 - _BETTER) * self.fitted
+
+    @property
+    def warnings(self) -> tuple[Warning, ...]:
+        """One, with the values and what to do."""
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in self.parameters.items())
+        if self.better:
+            text = (
+                "from other initial values physics alone explains the data better: its error is "
+                f"{self.residual:.3g} standard deviations of the output instead of "
+                f"{self.fitted:.3g}, with {values}. Give these as initial values, or bounds that "
+                "exclude them."
+            )
+            return (Warning("local_minimum", text),)
+        text = (
+            f"physics alone explains the data equally well with {values}. The intervals are those "
+            "of the solution next to the initial values; give bounds or better initial values to "
+            "choose one."
+        )
+        return (Warning("several_solutions", text),)
+
+
+def find_other_solution(
+    segmented: SegmentedMotion, solver: LevenbergMarquardt, q: Vector
+) -> OtherSolution | None:
+    """Return the best other minimum of physics alone that is as good as the one at `q`.
+
+    None where no start leads to one, or the record has too many rows for so many trainings.
+
+    Args:
+        segmented: with physics, and perhaps a learner; it runs without.
+        solver: its limits on iterations are kept where they are lower.
+        q: coordinates of the parameters that physics alone was fitted with (np,).
+    """
+    own, coordinates = segmented.physics_only, segmented.problem.motion.coordinates
+    if segmented.sums is not None or len(segmented.record) > _MOST_ROWS:
+        return None
+    solver = solver.at_most(RESTART_ITERATIONS)
+    with np.errstate(all="ignore"):
+        base = descend_from(own, solver, [q], None)
+        if base is None:
+            return None
+        fitted = residual_of(own, base)
+        found: list[tuple[float, FreeRunFit]] = []
+        for start in draw_starts(coordinates, [base.end.point.theta, coordinates.initial]):
+            other = descend_by_lengths(own, solver, start)
+            residual = residual_of(own, other)
+            if other is None or residual > (1 + _AS_GOOD) * fitted:
+                continue
+            if _is_another(own, base, other.end.point.theta):
+                found.append((residual, other))
+    if not found:
+        return None
+    residual, best = min(found, key=lambda one: one[0])
+    p = coordinates.physical(best.end.point.theta)
+    names = segmented.problem.motion.names
+    return OtherSolution(dict(zip(names, map(float, p), strict=True)), residual, fitted)
+
+
+def _is_another(own: SegmentedMotion, base: FreeRunFit, q: Vector) -> bool:
+    """Return whether q is far from the base where the base's curvature would forbid it."""
+    point = base.end.point
+    gram = information(own.from_states(point.states), point.theta)
+    noise = own.noise(base.objective, base.end)
+    if gram is None or noise is None:
+        return False
+    apart = np.asarray(q - point.theta)
+    variance = float(np.trace(own.problem.weight.whitened(noise))) / len(noise)
+    return bool(own.rms**2 * apart @ gram @ apart > _APART**2 * variance)
