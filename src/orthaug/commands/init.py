@@ -386,15 +386,22 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     proposed = (
         f'--inputs "{into}" --outputs "{_join(outputs) if output is None else output.header}"'
     )
+    others, clock = list_unused(found, [*found.signals]), found.clock.column
+    apart = f" No channels: {others}." if others else ""
+    if inputs is None and outputs is None and not free:
+        taken = f" {clock.header} is taken for the time." if clock else ""
+        return (
+            f"{found.path}: only {some} varies, so there is no pair of an input and an output."
+            f'{taken}{apart} Give both with --inputs and --outputs, or --inputs "" '
+            f'--outputs "{some}" where nothing drives it.'
+        )
     said = "the names of the columns do not show which are inputs and which outputs"
     if inputs is not None or outputs is not None:
         said = f"only {'inputs' if outputs is None else 'outputs'} are named"
     none = ' (--inputs "" for none)' if inputs is None and named else ""
-    others = list_unused(found, [*found.signals])
     return (
         f"{found.path}: {said}: {some}. Give both, separated by commas, such as "
-        f"{proposed}{none}; columns that are not named are left out."
-        + (f" No channels: {others}." if others else "")
+        f"{proposed}{none}; columns that are not named are left out.{apart}"
     )
 
 

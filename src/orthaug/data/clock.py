@@ -43,6 +43,8 @@ class RefusedColumn:
     column: Column
     reason: str
     signal: bool
+    fault: str = ""
+    """Of a column named as the time that rises in most rows: what is wrong with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,7 @@ class Clock:
     """
 
     step: float | None = None
-    """Sampling time in s."""
+    """Sampling time in s; without a column, that of most steps of one that is refused."""
     column: Column | None = None
     seconds: Vector | None = None
     """The instants in s, where the column holds them: it can be the spec's `time`."""
@@ -84,8 +86,11 @@ class Clock:
         )
 
     def __str__(self) -> str:
-        if self.column is None or self.step is None:
+        if self.step is None:
             return "no column states it"
+        if self.column is None:
+            one = next(one for one in self.refused if one.fault)
+            return f"{self.step:g} s is usual in column '{one.column.header}', which {one.fault}"
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
@@ -153,6 +158,10 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
             )
         elif verdict:
             refused.append(verdict)
+    faulty = next((one for one in refused if one.fault), None)
+    if clock.step is None and faulty is not None:
+        steps = np.diff(in_seconds(faulty.column.finite, faulty.column.header))
+        clock = Clock(float(f"{np.median(steps[steps > 0]):.6g}"))
     kept = tuple(
         one for one in refused if not clock.instants or not one.signal or is_time(one.column.header)
     )
@@ -186,7 +195,8 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
     went = f"stays at {values[at]:g}"
     if len(steps) and steps[at - 1] < 0:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
-    return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False)
+    fault = f"{went} in row {row}" if len(steps) and (steps > 0).mean() >= _RISES else ""
+    return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False, fault)
 
 
 def _resemblance(column: Column) -> RefusedColumn | bool | None:

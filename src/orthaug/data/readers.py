@@ -479,6 +479,11 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     )
     if odd.size:
         row = start + int(odd[0]) + 1
+        if steps[odd[0]] <= 0:  # `resample` needs rising instants, too
+            remedy = (
+                "expected rising time. Correct the row, take row ranges without it, or give "
+                "`sampling_time` instead of `time`."
+            )
         raise InputError(
             f"{table.path}: {table.where(row)}, column '{time}': a step of {steps[odd[0]]:g} s "
             f"where {usual:g} s is usual; {remedy}"

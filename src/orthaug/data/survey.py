@@ -174,7 +174,7 @@ def survey(path: Path) -> Survey:
             "must begin with # or %."
         )
     clock = find_clock(columns)
-    if clock.column is None:
+    if clock.column is None and clock.step is None:
         clock = replace(by_single_number(path), refused=clock.refused)
     return Survey(path, tuple(columns), clock, reading_note(path))
 

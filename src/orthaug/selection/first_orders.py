@@ -30,7 +30,9 @@ _BETTER = 1.2
 _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
+_EXACT = 1e-4  # of the output's deviation: below, more lags follow the rounding
 _DELAY = 20  # the largest delay that is looked for
+_PER_DELAY = 6  # rows of the longest experiment at least
 _SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
 _TELLING = 0.7  # error over the output's deviation, from which on a free run ranks no orders
@@ -137,7 +139,7 @@ def _smallest(
     if not tried:
         return None
     least = min(error for error, *_ in tried)
-    near = [one for one in tried if one[0] <= _AS_GOOD * least]
+    near = [one for one in tried if one[0] <= max(_AS_GOOD * least, _EXACT)]
     _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
     return least, orders, errors
 
@@ -155,35 +157,36 @@ def _delay(record: Record, number: int) -> int | None:
     Where rows or excitation do not allow that, by the cross-correlation with the input made white;
     where none is significant, by that of the input's square.
     """
-    found = []
-    long = tuple(e for e in record.experiments if len(e) > 2 * _DELAY)
+    longest = max(map(len, record.experiments))
+    found, most = [], max(_MOST, min(_DELAY, longest // _PER_DELAY))
+    long = tuple(e for e in record.experiments if len(e) > 2 * most)
     for j, output in enumerate(record.outputs if long else ()):
         one = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
         own = replace(record, outputs=(output,), experiments=one)
-        tested = _tested_delay(own, number)
-        found.append(correlated_delay(own, number, _DELAY) if tested is None else tested)
+        tested = _tested_delay(own, number, most)
+        found.append(correlated_delay(own, number, most) if tested is None else tested)
         if found[-1] is None:  # an even function of an input has no linear correlation with it
-            found[-1] = correlated_delay(own, number, _DELAY, squared=True)
+            found[-1] = correlated_delay(own, number, most, squared=True)
     seen = [lag for lag in found if lag is not None]
     return min(seen) if seen else None
 
 
-def _tested_delay(record: Record, number: int) -> int | None:
+def _tested_delay(record: Record, number: int, most: int) -> int | None:
     """Return the delay by t-tests, at 5 % for all lags together.
 
     None where none is significant or the lags cannot be separated.
     """
-    orders = Orders(_MOST, (_DELAY + 1,) * len(record.inputs), (0,) * len(record.inputs))
-    phi = np.concatenate([_rows(e, 0, orders, _DELAY) for e in record.experiments])
-    y = np.concatenate([e.outputs[_DELAY:, 0] for e in record.experiments])
+    orders = Orders(_MOST, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
+    phi = np.concatenate([_rows(e, 0, orders, most) for e in record.experiments])
+    y = np.concatenate([e.outputs[most:, 0] for e in record.experiments])
     q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
     if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / _RANK:
         return None
     theta = np.linalg.solve(r, q.T @ y)
     noise = float(np.linalg.norm(y - q @ (r @ theta))) / np.sqrt(len(y) - len(theta))
     std = noise * np.linalg.norm(np.linalg.inv(r), axis=1)
-    begin = _MOST + number * (_DELAY + 1)
-    lags = slice(begin, begin + _DELAY + 1)
+    begin = _MOST + number * (most + 1)
+    lags = slice(begin, begin + most + 1)
     over = np.flatnonzero(np.abs(theta[lags]) > _SURE * np.maximum(std[lags], 1e-300))
     return int(over[0]) if len(over) else None
 
