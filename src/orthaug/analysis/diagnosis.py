@@ -161,7 +161,9 @@ def _of_motion(
     followed = {test.name: test.follows() for test in tests if test.follows()}
     curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
     lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
-    explained = any(share.inputs > _SMALL for share in shares) or bool(curved) or lacks is not None
+    several = missing if missing is not None and missing.scattered else None
+    explained = any(share.inputs > _SMALL for share in shares) or bool(curved)
+    explained = explained or lacks is not None or several is not None
     white = all(test.practically_white() for test in tests)
     size = rms_errors(free_run) / fit.problem.deviation
     late = (
@@ -170,7 +172,7 @@ def _of_motion(
         else ()
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
-    text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks, late)
+    text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks or several, late)
     warnings = [one.warning for one in late]
     warnings += (
         []

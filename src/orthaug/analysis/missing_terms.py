@@ -192,6 +192,8 @@ _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
 _ROWS_PER_COLUMN = 5
 _PROBED = 20  # points at which an equation is looked at
 _MOVED = 1e-3  # of a parameter, to see whether an equation has it
+_ALONE = 0.05  # of the errors' variance: what a single term explains below it is small
+_TOGETHER_LEVEL, _TOGETHER = 1e-6, 0.2  # of the joint test, and of the errors' variance
 _RIVAL = 0.9  # of the best term's share, with which another one is named beside it
 
 
@@ -252,6 +254,16 @@ class MissingTest:
         """Return whether a term is surely missing and explains more than a share."""
         return bool(self.p < level and self.terms and self.terms[0].share > share)
 
+    @property
+    def scattered(self) -> bool:
+        """Whether terms that are small one by one surely explain a large share together.
+
+        A force of another form than those tried, such as a gap, is made up of several of them. The
+        level is far below the usual one, since long-lived disturbances resemble such terms.
+        """
+        small = all(term.share <= _ALONE for term in self.terms)
+        return small and self.p < _TOGETHER_LEVEL and self.share > _TOGETHER
+
 
 class _Regression(NamedTuple):
     """Rows of terms and errors beside what was estimated.
@@ -267,22 +279,23 @@ class _Regression(NamedTuple):
 def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
-    None where the runs have no slopes, or there are too few rows.
+    A difference that the equations contain, such as the stroke of a spring between two masses, is
+    a variable, too. None where the runs have no slopes, or there are too few rows.
     """
     motion = fit.problem.motion
     if not fit.segmented.dynamics.differentiable:
         return None
-    names = motion.visible
-    own = [(*motion.names_of_states, *motion.inputs).index(name) for name in names]
+    names, choice = _variables(motion)
     equations = doubted_equations(fit)
     count = 1 + len(SHAPES) * len(names)
     found_of: list[tuple[Vector, list[bool]]] = []
 
     def terms(points: Matrix) -> Terms:
-        size = np.abs(points[own]).max(axis=1, initial=0.0)
+        own = choice @ points
+        size = np.abs(own).max(axis=1, initial=0.0)
         size = np.where(size > 0, size, 1.0)
-        found_of.append((size, [not changes_sign(values) for values in points[own]]))
-        return lambda rows: _values(rows[own] / size[:, None], found_of[0][1])
+        found_of.append((size, [not changes_sign(values) for values in own]))
+        return lambda rows: _values(choice @ rows / size[:, None], found_of[0][1])
 
     found = sensitivities(fit, equations, terms, count)
     if found is None:
@@ -294,6 +307,20 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
     listed = [_term(motion, equations, names, j, coefficients, shares, *found_of[0]) for j in order]
     return MissingTest(p, freedom, share, tuple(listed))
+
+
+def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
+    """Return the names of the variables of terms, and their rows (n, nx + nu) by states and inputs.
+
+    They are the states and inputs that a learner may see, and differences of two of them that
+    stand in the equations.
+    """
+    every, names = (*motion.names_of_states, *motion.inputs), motion.visible
+    unit = np.eye(len(every))
+    pairs = [pair for pair in motion.differences if set(pair) <= set(names)]
+    rows = [unit[every.index(name)] for name in names]
+    rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
+    return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
 
 
 def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:

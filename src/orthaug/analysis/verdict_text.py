@@ -388,7 +388,8 @@ def _colour_warning(what: str) -> Warning:
 
 
 _BY_INNOVATIONS = (
-    ' Of disturbances, `noise.model` = "innovations" estimates the parameters with right intervals.'
+    ' If it is disturbances, `noise.model` = "innovations" gives right intervals; where physics is '
+    "missing, it does not."
 )
 
 
@@ -480,8 +481,15 @@ def describe_colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, 
 
 
 def _name_terms(lacks: MissingTest) -> str:
-    """Return the terms that are most likely missing."""
+    """Return the terms that are most likely missing, or the equations where many explain a part."""
     best, *others = lacks.terms
+    if lacks.scattered:
+        equations = ", ".join(dict.fromkeys(term.equation for term in lacks.terms))
+        return (
+            f"Simple terms of states and inputs explain {percent(lacks.share)} of it together, and "
+            f"no single one does: a force of another form is missing, most likely in the equation "
+            f"of {equations}."
+        )
     text = f"Most likely {best} would explain {percent(best.share)} of its mean square"
     if others:
         text += (

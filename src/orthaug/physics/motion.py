@@ -415,6 +415,22 @@ class Motion(NotebookView):
         return ()
 
     @property
+    def differences(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of names a, b whose difference a − b stands in an expression, each once.
+
+        Empty for a motion with functions.
+        """
+        if self.functions is not None:
+            return ()
+        found: dict[frozenset[str], tuple[str, str]] = {}
+        for expression in (*self.equations.values(), *(one for _, one in self.definitions)):
+            for node in ast.walk(expression.tree):
+                match node:
+                    case ast.BinOp(ast.Name(a), ast.Sub(), ast.Name(b)):
+                        found.setdefault(frozenset((a, b)), (a, b))
+        return tuple(found.values())
+
+    @property
     def visible(self) -> tuple[str, ...]:
         """Names of states and inputs that a learner may see."""
         return (*self.visible_states, *self.inputs)
