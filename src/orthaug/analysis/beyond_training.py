@@ -74,7 +74,7 @@ def describe_beyond(model: Model, radius: float | None) -> str:
     )
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
-    return f"{text}, so the free run is not bounded."
+    return f"{text}, so that proves no bound of the free run there."
 
 
 def _going_on(model: Model, kind: str) -> Model:

@@ -100,7 +100,10 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
     found = modes(model, x, u)
     if found is None:
         return MotionStability(None, (), "The motion has no finite derivative along its run.")
-    text = f"The linearised motion has {_sizes(found)} along the free run. "
+    held = model.form.motion.held
+    subject = "the closed loop" if held else "the motion"
+    linear = "linearised closed loop" if held else "linearised motion"
+    text = f"The {linear} has {_sizes(found)} along the free run. "
     if not found.growing:
         return MotionStability(found, (), text + _without_growth(found))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
@@ -109,11 +112,15 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
         f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
         f"{found.median:.4g} 1/s."
     )
-    often = found.growing > _OFTEN
-    if often and not model.form.motion.held:
-        text += " If a controller held the plant, give `controller` and the reference as input."
-    warnings = (Warning("growing_mode", text),) if often else ()
-    return MotionStability(found, warnings, text)
+    if found.growing <= _OFTEN:
+        return MotionStability(found, (), text)
+    warning = (
+        f"a mode of {subject} grows at {percent(found.growing, 3)} of the points of the free run, "
+        f"by up to {found.rightmost:.4g} 1/s: small errors grow there."
+    )
+    if not held and found.median > 0:  # the plant is unstable where it mostly is
+        warning += " If a controller held the plant, give `controller` and the reference as input."
+    return MotionStability(found, (Warning("growing_mode", warning),), text)
 
 
 def _sizes(found: Modes) -> str:

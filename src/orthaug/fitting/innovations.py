@@ -290,8 +290,9 @@ def check_predictor(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> li
     if radius < 1:
         return []
     text = (
-        f"the predictor is not stable: an error of its states grows by a factor of {radius:.3g} "
-        "a sample. Its predictions depend on where they start. Use more rows, or segments of "
-        "whole experiments."
+        "the predictor is not stable: an error of its states grows by a factor of "
+        f"{1 + float(f'{radius - 1:.1g}'):.9g} a sample. Its predictions depend on where they "
+        "start, and its intervals cover no more than the noise that it describes. Physics may be "
+        "missing: compare with a fit without [noise]."
     )
     return [Warning("predictor_unstable", text)]
