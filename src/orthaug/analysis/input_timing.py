@@ -87,7 +87,7 @@ def try_holds(
     motion, free_fit = problem.motion, task.physics
     found = [_declared_trial(task.plan, free_fit, declared=True)]
     several = not motion.scheme.discrete and bool(motion.driving) and free_fit is not None
-    if motion.hold == "zero-order" and _is_stepped(task.problem.record):
+    if motion.hold == "zero-order" and is_stepped(task.problem.record):
         several = False
     for hold in HOLDS if several else ():
         if hold != motion.hold:
@@ -96,7 +96,7 @@ def try_holds(
     return Trial(len(task.problem.record), substeps, tuple(found), task)
 
 
-def _is_stepped(record: Record) -> bool:
+def is_stepped(record: Record) -> bool:
     """Return whether an input keeps its value from most rows to the next, as a held one does."""
     inputs = record.experiments[0].inputs
     return bool(

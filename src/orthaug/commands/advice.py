@@ -19,6 +19,7 @@ from orthaug._base.lines import plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
+from orthaug.analysis.input_timing import is_stepped
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.spec import spec_model
 from orthaug.data.record import Record
@@ -243,12 +244,16 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
     """Yield the holds of the inputs that are not used yet."""
     if result.residuals is None or result.residuals.verdict != "unmodelled":
         return
+    stepped = job.train.source is None and is_stepped(job.train.record)
     for hold in job.physics.other_holds(job.spec):
+        if stepped and hold != "zero-order":  # it would only fit better by chance
+            continue
         yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
 
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
+_FAR_OFF = 3.0  # times the fit's own error: what a refit does not reach is no basis for trials
 _LISTED = 3  # changes without gain that the text names
 
 
@@ -382,6 +387,15 @@ def advise(
     base = trials.run(trials.changed_job({}), variant)
     if base is None:
         return None
+    own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
+    here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
+    if before > _FAR_OFF * here:
+        text = (
+            "No change of the spec was tried: fitted to fewer rows, the model has an error of "
+            f"{_error(before)} of the output's deviation in free run over {rows.where}, instead of "
+            f"{_error(here)}. Trials with so few rows would say little."
+        )
+        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
     chosen = found[: job.physics.most_trials]
     tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
     return _conclude_trials(base, tried, rows, len(found) - len(tried), learns)
@@ -419,7 +433,7 @@ def _conclude_trials(
     if worse:
         named = "; ".join(f"{one.proposal.words} ({_error_text(one)})" for one in worse[:_LISTED])
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
-        text += f" No gain from {_error(before)}: {named}{more}."
+        text += f" No sure gain over {_error(before)}: {named}{more}."
     if left:
         text += (
             f" {plural(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save time."
