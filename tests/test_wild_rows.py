@@ -33,6 +33,22 @@ def test_a_wrong_sample_in_training_is_named(at):
     assert f"row {at}" in text and 'step = "outliers"' in text
 
 
+def test_spikes_of_a_sensor_are_named_by_the_free_run():
+    """Each is in three rows of the one-step residual, and those are too many to be few."""
+    rng = np.random.default_rng(2)
+    u = rng.normal(size=1500)
+    y = scipy.signal.lfilter([0, 0.2], [1, -1.4, 0.6], u) + 0.02 * rng.normal(size=1500)
+    at = np.sort(rng.choice(1500, 15, replace=False))
+    y[at] += rng.choice([-1, 1], 15)
+    baseline = oa.Baseline.from_terms(
+        [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+    )
+    record = oa.Record.from_arrays(u, y, sampling_time=0.1)
+    fit = oa.estimate(record, baseline, learner=None, criterion=oa.Simulation())
+    (text,) = (w.text for w in oa.diagnose(fit).warnings if w.code == "wild_rows")
+    assert text.startswith("15 rows of 1498 make up") and f": row {at[0]};" in text
+
+
 def test_heavy_tails_alone_are_none():
     assert warned(0.0) == []
 

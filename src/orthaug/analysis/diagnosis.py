@@ -63,6 +63,7 @@ _HOLD = 0.5  # share of the squares in wild rows
 # Share of the rows that these are at most, and the number that is always few
 _FEW, _LEAST = (0.005, 6)
 _WILD = 20.0  # robust deviations; a normal residual reaches five
+_WILD_IN_RUN, _FEW_IN_RUN = 10.0, 0.02  # the same of a free run, whose lags do not repeat a row
 _MAD = 1.4826
 _NAMED = 3
 _LEVEL = 0.01  # of the test of missing terms
@@ -174,6 +175,7 @@ def _of_motion(
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks or several, late)
     warnings = [one.warning for one in late]
+    warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
     warnings += (
         []
         if white
@@ -236,7 +238,7 @@ def _of_lagged(
     )
     seen = replace(seen, steps={} if white else _steps(problem, tests))
     if not model.form.states:
-        return _conclude(replace(seen, **_effects(fit, one_step, one_step, False)))
+        return _conclude(replace(seen, **_effects(fit, one_step, one_step, False)), None)
     free_run = model.simulate(problem.record) if free_run is None else free_run
     skip = fit.criterion.washout
     free_runs = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
@@ -266,10 +268,10 @@ def _of_lagged(
         seen = replace(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
-    return _conclude(seen)
+    return _conclude(seen, free_run if free_runs else None)
 
 
-def _conclude(seen: Finding) -> Diagnosis:
+def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
     """Return the verdict and its words."""
     misfit = any(t.follows() or t.curved_over(SHARE) for t in seen.tests) or seen.lacks
     if (
@@ -287,7 +289,10 @@ def _conclude(seen: Finding) -> Diagnosis:
     seen = replace(seen, complete=complete)
     if verdict == "equation_noise" and seen.fit.criterion.simulates and seen.white:
         seen = replace(seen, changes=_toward_prediction(seen))
-    wild = wild_rows(seen.one_step, seen.fit.problem.record.experiments)
+    experiments = seen.fit.problem.record.experiments
+    wild = wild_rows(seen.one_step, experiments)
+    if not wild and free_run is not None:
+        wild = wild_rows(free_run, experiments, free_run=True)
     if wild:  # a larger learner would follow them
         seen = replace(
             seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
@@ -476,29 +481,37 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
     return 1.0 / smallest if smallest > 1.0 else 1.0
 
 
-def wild_rows(response: Response, experiments: Sequence[Experiment]) -> tuple[Warning, ...]:
-    """Return a warning for each output whose error comes mostly from a few distant rows."""
+def wild_rows(
+    response: Response, experiments: Sequence[Experiment], *, free_run: bool = False
+) -> tuple[Warning, ...]:
+    """Return a warning for each output whose error comes mostly from a few distant rows.
+
+    A wrong sample is one row of a free run's error, and as many more of a one-step residual as the
+    physics has lags: the former may be closer and more of them.
+    """
     found = []
     errors = errors_of(response)
     starts = [t.start for t in response.trajectories]
     rows = [(i, starts[i] + k) for i, error in enumerate(errors) for k in range(len(error))]
+    distance, few = (_WILD_IN_RUN, _FEW_IN_RUN) if free_run else (_WILD, _FEW)
     for j, output in enumerate(response.outputs):
         error = np.concatenate(errors)[:, j]
         size = np.abs(error - np.median(error))
-        wild = np.flatnonzero(size > _WILD * _MAD * np.median(size))
+        wild = np.flatnonzero(size > distance * _MAD * np.median(size))
         held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
         if (
             not len(wild)
-            or len(wild) > max(_LEAST, _FEW * len(error))
+            or len(wild) > max(_LEAST, few * len(error))
             or held < _HOLD
             or not np.median(size)
         ):
             continue
         named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
+        what = "error of the free run" if free_run else "one-step residual"
         text = (
             f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
-            f"squared one-step residual of {output.name}: {'; '.join(named)}{more}. Wrong "
+            f"squared {what} of {output.name}: {'; '.join(named)}{more}. Wrong "
             'samples among them bias θ: mark them (step = "outliers" of data.prepare), or '
             "leave them out."
         )

@@ -94,6 +94,8 @@ def find_other_solution(
             residual = residual_of(own, other)
             if other is None or residual > (1 + _AS_GOOD) * fitted:
                 continue
+            if not np.isfinite(coordinates.physical(other.end.point.theta)).all():
+                continue
             if _is_another(own, base, other.end.point.theta):
                 found.append((residual, other))
     if not found:

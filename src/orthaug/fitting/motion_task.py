@@ -101,9 +101,9 @@ def _descend_from_others(
     with np.errstate(all="ignore"):
         for start in draw_starts(coordinates, middles):
             other = descend_by_lengths(own, solver.at_most(RESTART_ITERATIONS), start)
-            if other is not None and (
-                best is None or other.end.point.misfit < best.end.point.misfit
-            ):
+            if other is None or not np.isfinite(coordinates.physical(other.end.point.theta)).all():
+                continue
+            if best is None or other.end.point.misfit < best.end.point.misfit:
                 best = other
     if best is None:
         return None
