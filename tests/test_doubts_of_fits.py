@@ -190,3 +190,40 @@ def ringing(force):
             v += 0.001 * (u - 0.05 * v - 9 * x)
             x += 0.001 * v
     return np.array(y)
+
+
+def second_order(disturbance, **options):
+    """The findings of complete physics, y = 1.5 y₁ − 0.7 y₂ + 0.5 u₁ + e, with a disturbance."""
+    rng = np.random.default_rng(11)
+    rows = len(disturbance)
+    u, y = rng.normal(size=rows), np.zeros(rows)
+    for k in range(2, rows):
+        y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + 0.5 * u[k - 1] + disturbance[k]
+    record = oa.Record.from_arrays(u, y + options.pop("added", 0.0), sampling_time=TS)
+    terms = oa.Baseline.from_terms(PHYSICS)
+    return oa.estimate(record, terms, learner=None, **options).diagnose()
+
+
+def test_a_disturbance_with_memory_is_told_from_missing_physics():
+    """Nothing but its own past predicts it: a noise model is the remedy, not a further term."""
+    rng = np.random.default_rng(5)
+    noise = np.zeros(1500)
+    for k in range(1, 1500):
+        noise[k] = 0.8 * noise[k - 1] + 0.05 * rng.normal()
+    found = second_order(noise, criterion=oa.Simulation())
+    text = dict((w.code, w.text) for w in found.warnings)["unexplained"]
+    assert "a disturbance with a memory of its own is likely" in text and '"auto"' in text
+    modelled = second_order(noise, criterion=oa.Prediction(), noise="auto")
+    assert "unexplained" not in {w.code for w in modelled.warnings}
+    for row, true in zip(modelled.parameters, (1.5, -0.7, 0.5), strict=True):
+        assert row.ci95[0] < true < row.ci95[1]
+
+
+@pytest.mark.parametrize("slope", [0.0, 1.0])
+def test_a_drift_is_named(slope):
+    rng = np.random.default_rng(6)
+    ramp = slope * np.linspace(-1, 1, 1500)
+    found = second_order(0.05 * rng.normal(size=1500), added=ramp, criterion=oa.Simulation())
+    texts = [w.text for w in found.warnings if w.code == "drift"]
+    assert len(texts) == (slope > 0)
+    assert all("drifts: a straight line over time makes up" in text for text in texts)

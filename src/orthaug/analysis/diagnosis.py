@@ -65,6 +65,8 @@ _FEW, _LEAST = (0.005, 6)
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _WILD_IN_RUN, _FEW_IN_RUN = 10.0, 0.02  # the same of a free run, whose lags do not repeat a row
 _MAD = 1.4826
+_DRIFTS = 0.5  # of the variance of a free run's error: a straight line
+_LINE = 50  # rows, from which on a straight line is one
 _NAMED = 3
 _LEVEL = 0.01  # of the test of missing terms
 # Of the output's deviation: a free run that leaves less has no dead time to look for
@@ -175,6 +177,7 @@ def _of_motion(
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks or several, late)
     warnings = [one.warning for one in late]
+    warnings += [] if white or fit.model.coloured else find_drift(free_run, "innovations")
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
     warnings += (
         []
@@ -298,7 +301,9 @@ def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
             seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
         )
     text, warnings = words(verdict, seen)
-    warnings = (*wild, *warnings)
+    described = seen.fit.model.coloured or (white and complete)
+    drift = () if described or free_run is None else find_drift(free_run, "auto")
+    warnings = (*wild, *drift, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
     return Diagnosis(
         verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None
@@ -479,6 +484,33 @@ def _noise_in_lags(problem: Problem, ratio: float | None, one_step: Response) ->
         lagged = lagged - rest @ np.linalg.lstsq(rest, lagged, rcond=None)[0]
     smallest = float(np.linalg.eigvalsh(lagged.T @ lagged / len(lagged)).min())
     return 1.0 / smallest if smallest > 1.0 else 1.0
+
+
+def find_drift(response: Response, kind: str) -> tuple[Warning, ...]:
+    """Return a warning for each output whose free-run error is mostly a straight line over time.
+
+    Args:
+        kind: the noise model that describes slow disturbances of such a fit.
+    """
+    found = []
+    for j, output in enumerate(response.outputs):
+        squares, lines, ends = 0.0, 0.0, (0.0, 0.0)
+        for error in (piece[:, j] for piece in errors_of(response) if len(piece) > _LINE):
+            time = np.linspace(-1.0, 1.0, len(error))
+            slope = float(time @ error / (time @ time))
+            squares += float(np.sum((error - error.mean()) ** 2))
+            lines += slope**2 * float(time @ time)
+            ends = max(ends, (error.mean() - slope, error.mean() + slope), key=np.ptp)
+        if lines > _DRIFTS * squares > 0:
+            unit = f" {output.unit}" if output.unit else ""
+            text = (
+                f"the error of the free run of {output.name} drifts: a straight line over time "
+                f"makes up {percent(lines / squares)} of its variance, from {ends[0]:.3g} to "
+                f"{ends[1]:.3g}{unit}. A sensor or a load may change slowly: describe it by "
+                f'`noise.model` = "{kind}", or measure what causes it. It may bias the parameters.'
+            )
+            found.append(Warning("drift", text))
+    return tuple(found)
 
 
 def wild_rows(

@@ -29,6 +29,8 @@ _LISTED = 3  # parameters, and terms with memory
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
 _LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
+_OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
+_UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
 _DETERMINED = re.compile(
     r"( The data determine | Of the physical parameters they determine )[^.]*\."
     r"|: the data determine [^.]*"
@@ -60,8 +62,7 @@ def doubt(made: E) -> E:
         warnings.append(
             Warning(
                 code="unexplained",
-                text=_unexplained_text(test, left, bool(result.residuals))
-                + _withdrawal(result, left),
+                text=_unexplained_text(test, left, fit, result) + _withdrawal(result, left),
             )
         )
     hidden = test is not None and test.has_memory and left <= _LEFT
@@ -134,12 +135,20 @@ def _noise_only(
     ]
 
 
-def _unexplained_text(test: StructureTest | None, left: float, judged: bool) -> str:
+def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result: Findings) -> str:
     if left > _LEFT:
         what = f"the model's error contains more than noise: {_functions_text(left)}"
     elif test is None or not test.found:
         what = "the residual contains more than noise"
-        what += " (its verdict is `unmodelled`)" if judged else ""
+        what += " (its verdict is `unmodelled`)" if result.residuals else ""
+        if _is_disturbance(fit, result):
+            kind = "innovations" if result.motion is not None else "auto"
+            return (
+                f"{what}, and neither the inputs nor functions of the regressors predict it: a "
+                "disturbance with a memory of its own is likely. The 95 % intervals count white "
+                f'noise only. Describe it by `noise.model` = "{kind}"; if physics with memory is '
+                "missing instead, such as a hysteresis, that does not make the intervals right."
+            )
     elif test.is_far:
         what = (
             f"the free run errs by {percent(test.off)} of the output's deviation, and more than "
@@ -160,6 +169,16 @@ def _unexplained_text(test: StructureTest | None, left: float, judged: bool) -> 
         f"{what}. The 95 % intervals count noise only; missing physics may have moved the "
         "parameters by more. Search for its terms with `[[suspects]]` or `orthaug explain`. "
         "Write them into the physics, or let the learner see what they depend on."
+    )
+
+
+def _is_disturbance(fit: Any, result: Findings) -> bool:
+    """Return whether the residual follows from its own past alone, without a noise model of it."""
+    shares = (result.residuals.predictable if result.residuals else None) or ()
+    return (
+        not fit.model.coloured
+        and any(one.own_past > _OWN_PAST for one in shares)
+        and all(max(one.inputs, one.functions) < _UNRELATED * one.own_past for one in shares)
     )
 
 
