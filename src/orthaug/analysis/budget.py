@@ -56,6 +56,7 @@ from orthaug.physics.parameters import PhysicsMap
 
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _ALIKE = 1e-6  # of a bias
+_WHOLE = 0.95  # of what the learner found: a cause that may stand in its place
 _LISTED = 4  # parameters that a warning lists at most
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
 
@@ -548,7 +549,8 @@ def _biased_warning(
     causes: Causes, large: Sequence[ParameterBias], remedies: Sequence[str], *, learns: bool
 ) -> Warning:
     """Return the warning on large biases: causes, sizes, remedies, and how sure the causes are."""
-    several, cure = len(causes.entries) > 1, " or ".join(remedies)
+    several = len(causes.entries) > 1
+    cure = " or ".join([*(_as_physics(causes) if learns else ()), *remedies])
     where = "" if causes.output is None else f" in {causes.output}"
     listed, moves = " and ".join(map(_describe_cause, causes.entries)), list_biases(large)
     first = sorted(causes.rivals, key=lambda entry: entry.share, reverse=True)[:2]
@@ -570,6 +572,21 @@ def _biased_warning(
         f"move{'' if several else 's'} {moves}. The standard errors do not cover this "
         f"bias{other}{f'. Remedy: {cure}' if cure else ''}.",
     )
+
+
+def _as_physics(causes: Causes) -> tuple[str, ...]:
+    """Return the remedy to write causes that explain nearly all into the physics; else none.
+
+    A term with memory is no expression of one row.
+    """
+    suspects = [entry.suspect for entry in causes.entries]
+    if causes.share < _WHOLE or any(getattr(one, "memory", None) is not None for one in suspects):
+        return ()
+    named = " and ".join(
+        one.expression + (f" in the equation of {entry.equation}" if entry.equation else "")
+        for one, entry in zip(suspects, causes.entries, strict=True)
+    )
+    return (f"write {named} into the physics with a coefficient as parameter",)
 
 
 def _describe_cause(entry: SuspectedBias) -> str:

@@ -130,6 +130,8 @@ def _analyse(
         fit = attempt(
             "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
         )
+        if fit.std is not None:  # the robust ones need no covariance of the weights
+            warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
         warnings += closed_loop(evidence.train.record, evidence.method)
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")

@@ -282,7 +282,7 @@ def _by_inputs(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) 
     if best[1]:
         listed = ", ".join(f'"{text}"' for text in best[0])
         rest = "" if len(best[1]) == len(biased) else f" for {', '.join(best[1])}"
-        yield f"set learner.inputs = [{listed}]{rest}"
+        yield f"set learner.inputs = [{listed}]{rest}, where what is missing depends on no more"
 
 
 def _by_measure(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:
