@@ -131,27 +131,39 @@ def fit(
         raise failure
 
 
-@app.command(epilog="Example: orthaug compare spec.toml --out comparison")
+@app.command(epilog="Examples: orthaug compare spec.toml; orthaug compare resultA resultB")
 def compare(
-    spec: SpecPath,
-    out: Annotated[Path | None, out_folder("orthaug-out/SPEC")] = None,
+    what: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SPEC | RESULT RESULT...",
+            help="A spec file, or the result folders of two fits or more.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, out_folder("orthaug-out/SPEC, or orthaug-out/comparison of results")
+    ] = None,
     model: Annotated[
         list[Path] | None,
         typer.Option(
             "--model",
             metavar="MODEL",
-            help="A saved model to compare with; may be repeated.",
+            help="A saved model to compare with a spec; may be repeated.",
             show_default="none",
         ),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Compare physics alone and every structure in one table."""
+    """Compare physics alone and every structure, or saved results, in one table."""
+    if len(what) > 1 or what[0].is_dir():
+        _compare_results(what, out, model or [], as_json=as_json, force=force)
+        return
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.opening import open_job
     from orthaug.reports.text import compare_text
 
+    spec = what[0]
     folder = out or Path("orthaug-out") / spec.stem
     check_folder(folder, force=force)
     job = open_job(spec)
@@ -169,6 +181,30 @@ def compare(
     print_result(
         comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder
     )
+
+
+def _compare_results(
+    results: list[Path], out: Path | None, model: list[Path], *, as_json: bool, force: bool
+) -> None:
+    """Compare saved results: nothing is trained."""
+    from orthaug._base.errors import InputError
+    from orthaug.commands.folder import check_folder, check_kept
+
+    if model:
+        raise InputError("--model: belongs to a spec; give its result folder among the others.")
+    if len(results) == 1:
+        raise InputError(f"{results[0]}: is one folder; expected a spec, or two result folders.")
+    folder = out or Path("orthaug-out") / "comparison"
+    check_folder(folder, force=force)
+    check_kept(folder, *results)
+    prepare_jax()
+    from orthaug.commands import saved_results
+
+    found = saved_results.read_results(results)
+    asked = arguments("compare", *results, out=out, json=as_json, force=force)
+    comparison = saved_results.compare_results(found, asked)
+    saved_results.write(comparison, folder, force=force)
+    print_result(comparison.result, comparison.summary(), as_json, folder)
 
 
 @app.command(epilog="Example: orthaug design spec.toml --out input.csv")
