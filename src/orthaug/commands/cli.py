@@ -17,6 +17,7 @@ import typer
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
+from orthaug._base.lines import fold
 from orthaug.commands import streams
 from orthaug.commands.bars import GO_ON, on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
@@ -131,17 +132,17 @@ def fit(
         raise failure
 
 
-@app.command(epilog="Examples: orthaug compare spec.toml; orthaug compare resultA resultB")
+@app.command(epilog="Example: orthaug compare spec.toml --out comparison")
 def compare(
     what: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SPEC | RESULT RESULT...",
+            metavar="SPEC|RESULT",
             help="A spec file, or the result folders of two fits or more.",
         ),
     ],
     out: Annotated[
-        Path | None, out_folder("orthaug-out/SPEC, or orthaug-out/comparison of results")
+        Path | None, out_folder("orthaug-out/SPEC; of results orthaug-out/comparison")
     ] = None,
     model: Annotated[
         list[Path] | None,
@@ -155,7 +156,10 @@ def compare(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Compare physics alone and every structure, or saved results, in one table."""
+    """Compare physics alone and every structure, or saved results, in one table.
+
+    Two saved results of the same data: orthaug compare result other-result
+    """
     if len(what) > 1 or what[0].is_dir():
         _compare_results(what, out, model or [], as_json=as_json, force=force)
         return
@@ -413,7 +417,8 @@ def init(
     spec = draft(found, roles, out, declared)
     report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
-    streams.echo(f"{spec.account}\n\nwritten to {out}\nnext: orthaug fit {out}")
+    account = "\n".join(fold([spec.account]))
+    streams.echo(f"{account}\n\nwritten to {out}\nnext: orthaug fit {out}")
 
 
 def _silent(line: str) -> None:

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 SHOWN = 8  # signals of a design that are listed
 NOISE_ONLY = "95 %, noise only"  # head of intervals that do not count missing physics
 _LONGEST_SETTING = 30  # characters of a cell
+_LONGEST_SIGNAL = 44  # characters of the name of a design: beside its numbers on 80 columns
 ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
@@ -251,7 +252,10 @@ def design_text(result: DesignResult) -> str:
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
         rows.append(
-            [signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))]
+            [
+                cut(signal.name, _LONGEST_SIGNAL),
+                *map(_or_infinite, (error, signal.bias, signal.std, signal.condition)),
+            ]
         )
     lines = [
         f"input       {result.kind}",
