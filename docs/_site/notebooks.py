@@ -24,7 +24,7 @@ import documents  # noqa: E402  (of the folder above)
 SHOWN = {
     "terms": ["fit", 'fit.plot.learned("y[k-1]");'],
     "several_outputs": ["fit", "fit.plot.free_run();"],
-    "memory": ["fit", "fit.plot();"],
+    "memory": ["fit", "fit.plot.free_run();"],
 }
 """Tutorials, and the cells that a notebook has in the place of the picture."""
 PICTURE = re.compile(r"!\[[^\]]*\]\([^)]*\)\n+(\*[^\n]*\*\n)?")
