@@ -245,6 +245,33 @@ def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_dat
     assert [stripe["x0"], stripe["x1"]] == pytest.approx([inside[0], inside[-1]], rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        (
+            {"controller": {"output": "u", "reference": "r", "measured": "y", "Kp": 20.0, "Kd": 4}},
+            "simulated with its controller, which sets u from r − y: Kp = 20.0, Kd = 4.",
+        ),
+        (
+            {"controller": {"output": "u", "measured": "y", "numerator": [2], "denominator": [1]}},
+            "which sets u from 0 − y: numerator = [2], denominator = [1].",
+        ),
+        (
+            {"controller": {"outputs": {"u": "K*e"}, "states": {"e": {"next": "r - y"}}}},
+            "simulated with its controller: u = K*e, next e = r - y.",
+        ),
+        (
+            {"motion": {"source": {"file": "cart.xml", "learned": ["hinge.velocity"]}}},
+            "are those of cart.xml, with the states x, v; the learner is beside hinge.velocity.",
+        ),
+    ],
+)
+def test_a_loop_has_its_controller_and_a_source_its_file(motion, section, words):
+    result = motion.result.model_copy(update={"spec": {**motion.result.spec, **section}})
+    page = fit_page(FitPage(origin_of(motion.job, "fit"), result, motion.responses))
+    assert words in " ".join("".join(Read(page).text("section", id="parameters")).split())
+
+
 def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages):
     (surface,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("colorbar")]
     heat = surface["data"][0]
