@@ -433,6 +433,17 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
     assert len(json.dumps([both.traces, both.series])) < LARGEST - 2_200_000
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_samples_share_pixels_the_measured_curve_is_an_area_and_a_model_its_outline(
+    pages, kind
+):
+    runs = [f for f in figures(pages[kind]) if "measured 0" in (f["series"] or {})]
+    drawn = {t["name"]: t.get("envelope") for f in runs for t in f["data"] if "series" in t}
+    assert drawn.pop("measured") == "area"
+    assert "outline" in drawn.values()
+    assert kind != "compared" or set(drawn.values()) == {"outline"}
+
+
 def test_packed_curves_keep_their_digits_beside_an_offset():
     given = 1e6 + np.sin(np.arange(100.0))
     assert values(pack_curve(given, 0.0, 1.0)) == pytest.approx(given, abs=1e-6)
