@@ -11,6 +11,9 @@ import jsonschema
 import pytest
 from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, write_csv
 
+import orthaug as oa
+from orthaug import InputError
+
 pytestmark = pytest.mark.usefixtures("without_figures")
 
 HELD_OUT = SPEC.replace("[data.tests", '[data.validation]\nfiles = ["valid.csv"]\n[data.tests')
@@ -186,3 +189,30 @@ def test_what_cannot_be_compared_is_refused(fits, tmp_path, monkeypatch, given, 
     assert (done.code, done.out) == (2, "")
     assert one_line(done.err, words)
     assert listing(Path()) == before
+
+
+def test_from_python(results, tmp_path):
+    folders = [str(results / "physics"), str(results / "network")]
+    found = oa.compare(folders, out=tmp_path / "out")
+    assert found.result.content() == result_of(tmp_path / "out")
+    assert found.summary() in run("compare", *folders, "--out", tmp_path / "again").out
+    assert repr(found) == f"SavedComparison({', '.join(folders)})"
+    for name, folder in zip(found.responses, folders, strict=True):
+        own = result_of(Path(folder))["scores"]
+        for part, free in found.responses[name].items():
+            scored = free.scores((5,) if part == "tests.steps" else (0,))
+            assert list(scored.rmse) == pytest.approx(own[part]["simulation"]["rmse"], rel=1e-9)
+    assert oa.plot(found.result) is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "models", "words"),
+    [
+        ([], (), "no folder is given; expected a spec, or two result folders"),
+        (["out/physics", 3], (), "`spec` must be a spec, or a list of result folders"),
+        (["out/physics", "out/z"], ["out/z"], "`models` belong to a spec"),
+    ],
+)
+def test_what_python_cannot_compare(results, given, models, words):
+    with pytest.raises(InputError, match=words):
+        oa.compare(given, models)  # type: ignore[call-overload]

@@ -196,8 +196,6 @@ def _compare_results(
 
     if model:
         raise InputError("--model: belongs to a spec; give its result folder among the others.")
-    if len(results) == 1:
-        raise InputError(f"{results[0]}: is one folder; expected a spec, or two result folders.")
     folder = out or Path("orthaug-out") / "comparison"
     check_folder(folder, force=force)
     check_kept(folder, *results)

@@ -79,8 +79,12 @@ def read_results(paths: Sequence[Path]) -> list[SavedResult]:
     """Return saved results of the same outputs and data.
 
     Raises:
-        InputError: a folder that holds no result of a fit, or results that share no data.
+        InputError: one folder alone, or one that holds no result of a fit; results that share no
+            data.
     """
+    if len(paths) < 2:
+        given = f"{paths[0]}: is one folder" if paths else "no folder is given"
+        raise InputError(f"{given}; expected a spec, or two result folders.")
     found: list[SavedResult] = []
     for path in paths:
         if str(path) in [one.name for one in found]:
