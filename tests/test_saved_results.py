@@ -158,6 +158,7 @@ def test_a_model_in_a_result_stands_for_it(results, tmp_path):
         (["out/physics", "out/physics"], "out/physics: is given twice"),
         (["out/physics", "network.toml"], "network.toml: is a file; expected the result folders"),
         (["out/physics", "nowhere"], "nowhere: there is no such folder"),
+        (["out/physics", "x" * 300], "… there is no such folder"),
         (["out/physics", "empty"], "empty: has no result.json that can be read"),
         (["out/physics", "broken"], "broken: has no result.json that can be read"),
         (["out/physics", "of_check"], "of_check: its result.json is no result of `orthaug fit`"),

@@ -6,6 +6,7 @@ Results go to standard output, progress and errors to standard error.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -160,7 +161,7 @@ def compare(
 
     Two saved results of the same data: orthaug compare result other-result
     """
-    if len(what) > 1 or what[0].is_dir():
+    if len(what) > 1 or os.path.isdir(what[0]):
         _compare_results(what, out, model or [], as_json=as_json, force=force)
         return
     from orthaug.commands.folder import check_folder, check_inputs_kept

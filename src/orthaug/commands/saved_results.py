@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -168,8 +169,8 @@ def _read(path: Path) -> SavedResult:
     Raises:
         InputError: there is none, or its training failed.
     """
-    if not path.is_dir():
-        what = "is a file" if path.exists() else "there is no such folder"
+    if not os.path.isdir(path):  # false of a name that no file can have, where pathlib raises
+        what = "is a file" if os.path.exists(path) else "there is no such folder"
         raise InputError(f"{path}: {what}; {_EXPECTED}, or one spec.")
     content = next(results_beside(path), None)
     if content is None:
