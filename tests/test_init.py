@@ -417,7 +417,8 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
     t[200:] += 20.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
-    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in done.out, done.err
+    told = " ".join(done.out.split())
+    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in told, done.err
     job = load_spec(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].step == "resample"
     assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
@@ -652,7 +653,8 @@ def test_why_a_column_is_not_the_time_is_said(request, tmp_path, header, values,
     )
     known = "0.02 s is usual" if "begins" in request.node.name else "no column states it"
     assert done.code == 0 and f"sampling time: {known}" in done.out, done.err
-    assert any(header in line and reason in line for line in done.out.splitlines()), done.out
+    told = done.out.replace("\n  ", " ").splitlines()  # folded lines go on indented
+    assert any(header in line and reason in line for line in told), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])
 
@@ -682,9 +684,8 @@ def test_what_follows_from_the_past_of_others_is_an_output(tmp_path, monkeypatch
     file = write_columns(tmp_path / "a.csv", level=z, valve=u, wind=w, other=rng.normal(size=600))
     done = run("init", file, "--out", tmp_path / "a.toml")
     assert done.code == 0
-    assert (
-        "past values of 'valve' and 'wind' help to predict 'level', but not the reverse" in done.out
-    )
+    told = " ".join(done.out.split())
+    assert "past values of 'valve' and 'wind' help to predict 'level', but not the reverse" in told
     assert "left out: other" in done.out
     spec = (tmp_path / "a.toml").read_text()
     assert 'inputs = ["valve", "wind"]' in spec and 'outputs = ["level"]' in spec

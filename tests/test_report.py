@@ -245,6 +245,33 @@ def test_what_a_motion_learned_is_a_curve_with_its_band_and_the_reach_of_the_dat
     assert [stripe["x0"], stripe["x1"]] == pytest.approx([inside[0], inside[-1]], rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        (
+            {"controller": {"output": "u", "reference": "r", "measured": "y", "Kp": 20.0, "Kd": 4}},
+            "simulated with its controller, which sets u from r − y: Kp = 20.0, Kd = 4.",
+        ),
+        (
+            {"controller": {"output": "u", "measured": "y", "numerator": [2], "denominator": [1]}},
+            "which sets u from 0 − y: numerator = [2], denominator = [1].",
+        ),
+        (
+            {"controller": {"outputs": {"u": "K*e"}, "states": {"e": {"next": "r - y"}}}},
+            "simulated with its controller: u = K*e, next e = r - y.",
+        ),
+        (
+            {"motion": {"source": {"file": "cart.xml", "learned": ["hinge.velocity"]}}},
+            "are those of cart.xml, with the states x, v; the learner is beside hinge.velocity.",
+        ),
+    ],
+)
+def test_a_loop_has_its_controller_and_a_source_its_file(motion, section, words):
+    result = motion.result.model_copy(update={"spec": {**motion.result.spec, **section}})
+    page = fit_page(FitPage(origin_of(motion.job, "fit"), result, motion.responses))
+    assert words in " ".join("".join(Read(page).text("section", id="parameters")).split())
+
+
 def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages):
     (surface,) = [f for f in figures(pages["lagged"]) if f["data"][0].get("colorbar")]
     heat = surface["data"][0]
@@ -404,6 +431,17 @@ def test_long_records_are_thinned_by_their_envelope_and_said_to_be():
     assert len(values(short.series["measured 0"])) == 5000 and "is drawn by" not in short.caption
     both = compared_plots({name: {"train": long} for name in "abc"})[0]
     assert len(json.dumps([both.traces, both.series])) < LARGEST - 2_200_000
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_where_samples_share_pixels_the_measured_curve_is_an_area_and_a_model_its_outline(
+    pages, kind
+):
+    runs = [f for f in figures(pages[kind]) if "measured 0" in (f["series"] or {})]
+    drawn = {t["name"]: t.get("envelope") for f in runs for t in f["data"] if "series" in t}
+    assert drawn.pop("measured") == "area"
+    assert "outline" in drawn.values()
+    assert kind != "compared" or set(drawn.values()) == {"outline"}
 
 
 def test_packed_curves_keep_their_digits_beside_an_offset():

@@ -14,8 +14,10 @@ from test_cli import MLP, SPEC, make_project
 import orthaug as oa
 from orthaug import Channel, Response, Trajectory
 from orthaug.commands.compare import compare_report
+from orthaug.commands.fit import write_result
 from orthaug.commands.job import origin_of
-from orthaug.reports.page import fit_page
+from orthaug.reports.page import compare_page, fit_page
+from orthaug.reports.page_compare import ComparePage
 from orthaug.reports.page_fit import FitPage
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -50,9 +52,13 @@ def folder(tmp_path_factory) -> Path:
     long = FitPage(
         origin_of(fitted.job, "fit"), fitted.result, {p: long_run(p) for p in fitted.responses}
     )
+    write_result(fitted, folder / "one")
+    shutil.copytree(folder / "one", folder / "other")
+    beside = oa.compare([str(folder / "one"), str(folder / "other")])
     pages = {
         "fit": fitted.report().html,
         "compared": compare_report(oa.compare(fitted.job)),
+        "saved": compare_page(ComparePage(beside.origin, beside.result, beside.responses)),
         "long": fit_page(long),
     }
     for name, page in pages.items():
@@ -114,7 +120,7 @@ def shown_range(page, plot: str) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize("name", ["fit", "compared", "long"])
+@pytest.mark.parametrize("name", ["fit", "compared", "saved", "long"])
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_a_page_is_drawn_without_error_and_network_and_fits_its_width(
     browser, folder, name, width, scheme

@@ -6,6 +6,7 @@ Results go to standard output, progress and errors to standard error.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,6 +18,7 @@ import typer
 
 from orthaug._base.checks import check_choice
 from orthaug._base.errors import TrainingError
+from orthaug._base.lines import fold
 from orthaug.commands import streams
 from orthaug.commands.bars import GO_ON, on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
@@ -133,25 +135,40 @@ def fit(
 
 @app.command(epilog="Example: orthaug compare spec.toml --out comparison")
 def compare(
-    spec: SpecPath,
-    out: Annotated[Path | None, out_folder("orthaug-out/SPEC")] = None,
+    what: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SPEC|RESULT",
+            help="A spec file, or the result folders of two fits or more.",
+        ),
+    ],
+    out: Annotated[
+        Path | None, out_folder("orthaug-out/SPEC; of results orthaug-out/comparison")
+    ] = None,
     model: Annotated[
         list[Path] | None,
         typer.Option(
             "--model",
             metavar="MODEL",
-            help="A saved model to compare with; may be repeated.",
+            help="A saved model to compare with a spec; may be repeated.",
             show_default="none",
         ),
     ] = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Compare physics alone and every structure in one table."""
+    """Compare physics alone and every structure, or saved results, in one table.
+
+    Two saved results of the same data: orthaug compare result other-result
+    """
+    if len(what) > 1 or os.path.isdir(what[0]):
+        _compare_results(what, out, model or [], as_json=as_json, force=force)
+        return
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.opening import open_job
     from orthaug.reports.text import compare_text
 
+    spec = what[0]
     folder = out or Path("orthaug-out") / spec.stem
     check_folder(folder, force=force)
     job = open_job(spec)
@@ -169,6 +186,28 @@ def compare(
     print_result(
         comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder
     )
+
+
+def _compare_results(
+    results: list[Path], out: Path | None, model: list[Path], *, as_json: bool, force: bool
+) -> None:
+    """Compare saved results: nothing is trained."""
+    from orthaug._base.errors import InputError
+    from orthaug.commands.folder import check_folder, check_kept
+
+    if model:
+        raise InputError("--model: belongs to a spec; give its result folder among the others.")
+    folder = out or Path("orthaug-out") / "comparison"
+    check_folder(folder, force=force)
+    check_kept(folder, *results)
+    prepare_jax()
+    from orthaug.commands import saved_results
+
+    found = saved_results.read_results(results)
+    asked = arguments("compare", *results, out=out, json=as_json, force=force)
+    comparison = saved_results.compare_results(found, asked)
+    saved_results.write(comparison, folder, force=force)
+    print_result(comparison.result, comparison.summary(), as_json, folder)
 
 
 @app.command(epilog="Example: orthaug design spec.toml --out input.csv")
@@ -377,7 +416,8 @@ def init(
     spec = draft(found, roles, out, declared)
     report_stage("opening the spec as a fit would")
     write_spec(spec, out, force=force)
-    streams.echo(f"{spec.account}\n\nwritten to {out}\nnext: orthaug fit {out}")
+    account = "\n".join(fold([spec.account]))
+    streams.echo(f"{account}\n\nwritten to {out}\nnext: orthaug fit {out}")
 
 
 def _silent(line: str) -> None:

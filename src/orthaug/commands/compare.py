@@ -76,7 +76,7 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         "spec": job.declaration,
         "data": job.data,
         "comparison": rows,
-        "chosen": _choose_row(rows, criterion.simulates) if job.validation else None,
+        "chosen": choose_row(rows, criterion.simulates) if job.validation else None,
         "left_out": left_out,
         "warnings": job.warnings,
     }
@@ -170,18 +170,18 @@ def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
     own = {key: getattr(result, key) for key in ("parameters", "orthogonality_defect", "residuals")}
     own |= {"status": result.status.code, "seconds": result.status.seconds, "validation": verdict}
     share = dominance(fit) if fit.status.ok else None
-    return _row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
+    return row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
 
 
 def _saved_row(name: str, model: Model, job: Job) -> RowResult:
     warnings: list[Any] = []
     scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
-    return _row_of(
+    return row_of(
         name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated)
     )
 
 
-def _row_of(
+def row_of(
     name: str, model: Model, scores: Any, warnings: Sequence[Any], **content: Any
 ) -> RowResult:
     """Return a row of the table; keys that `content` lacks are null."""
@@ -194,7 +194,7 @@ def _row_of(
     )
 
 
-def _choose_row(rows: Sequence[RowResult], simulates: bool) -> str | None:
+def choose_row(rows: Sequence[RowResult], simulates: bool) -> str | None:
     """Return the row with the lowest error on the validation part, by the criterion of training.
 
     Physics alone wins where the verdict is that the learner of that row does not help.

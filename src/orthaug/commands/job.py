@@ -511,15 +511,20 @@ def _toml(job: Job) -> str:
 
     Where its file has changed since, it is the content that was read.
     """
-    import tomlkit
-
     try:
         text = job.path.read_text(encoding="utf-8-sig")
         if load_spec(job.path).model_dump(mode="json", exclude_unset=True) == job.declaration:
             return text
     except (InputError, OSError, UnicodeDecodeError):
         pass
-    return tomlkit.dumps(_without_none(job.declaration))
+    return toml_of(job.declaration)
+
+
+def toml_of(declaration: Mapping[str, Any]) -> str:
+    """Return the text of a spec that was read."""
+    import tomlkit
+
+    return tomlkit.dumps(_without_none(declaration))
 
 
 def _without_none(content: Any) -> Any:

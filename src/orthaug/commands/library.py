@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Never, overload
 
 from orthaug._base.checks import check_type
 from orthaug._base.errors import InputError, TrainingError
@@ -19,7 +19,7 @@ from orthaug.analysis.doubts import doubt
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.examination import with_verdict
 from orthaug.commands.fit import FitReport, fit_job, fit_report, report_of, write_result
-from orthaug.commands.folder import check_folder, check_inputs_kept
+from orthaug.commands.folder import check_folder, check_inputs_kept, check_kept
 from orthaug.commands.job import Job, origin_of
 from orthaug.commands.opening import job_physics, open_job
 from orthaug.commands.parts import FilePart
@@ -34,6 +34,7 @@ from orthaug.models.rows import InMemory
 if TYPE_CHECKING:
     from orthaug.commands.compare import Comparison
     from orthaug.commands.recover import Rehearsal
+    from orthaug.commands.saved_results import SavedComparison
 
 Spec = str | os.PathLike | Job
 NAME = "fit.report()"
@@ -78,33 +79,68 @@ def fit_spec(spec: Spec, out: str | os.PathLike | None = None) -> FitReport:
     return fitted
 
 
+@overload
 def compare(
     spec: Spec, models: Sequence[str | os.PathLike] = (), out: str | os.PathLike | None = None
-) -> Comparison:
+) -> Comparison: ...
+@overload
+def compare(
+    spec: list[str] | list[Path], models: Sequence[Never] = (), out: str | os.PathLike | None = None
+) -> SavedComparison: ...
+def compare(
+    spec: Spec | list[str] | list[Path],
+    models: Sequence[str | os.PathLike] = (),
+    out: str | os.PathLike | None = None,
+) -> Comparison | SavedComparison:
     """Compare physics alone and every structure on the same data and seeds, as `orthaug compare`.
 
     Args:
-        spec: a spec file, or what `load_spec` returned.
-        models: folders of saved models to put beside.
+        spec: a spec file, or what `load_spec` returned; or a list of the result folders of two
+            fits or more to the same data, which are set side by side, and nothing is trained.
+        models: folders of saved models to put beside a spec.
         out: folder to write result, models and figure into; None to write nothing.
 
     Returns:
         `fitted`, one `FitReport` by the name of the structure; `verdicts`, whether the learner
         helps in each; `result`, the content of result.json; `summary()`, what the command prints.
+        Of saved results `result`, `responses` (free runs by result and part) and `summary()`.
 
     Raises:
-        InputError: as `fit_spec`; a model that does not fit the data.
+        InputError: as `fit_spec`; a model that does not fit the data; results that share no data.
     """
     if isinstance(models, str | os.PathLike) or not isinstance(models, Sequence):
         raise InputError("`models` must be a list of folders, such as ['orthaug-out/spec'].")
     for model in models:
         check_type(model, str | os.PathLike, "models", "a list of folders")
+    if isinstance(spec, list):
+        if models:
+            raise InputError("`models` belong to a spec; give them among the results instead.")
+        return _compare_results(spec, out)
     job, folder = _open(spec, out)
     from orthaug.commands import compare as comparing
 
     comparison = comparing.compare(job, [Path(model) for model in models])
     if folder is not None:
         comparing.write(comparison, folder)
+    return comparison
+
+
+def _compare_results(
+    folders: Sequence[str | os.PathLike], out: str | os.PathLike | None
+) -> SavedComparison:
+    from orthaug.commands import saved_results
+
+    for folder in folders:
+        check_type(folder, str | os.PathLike, "spec", "a spec, or a list of result folders")
+    check_type(out, str | os.PathLike | None, "out", "the name of a folder, or None")
+    paths = [Path(folder) for folder in folders]
+    if out is not None:
+        check_folder(Path(out))
+        check_kept(Path(out), *paths)
+    found = saved_results.read_results(paths)
+    comparison = saved_results.compare_results(found, ("compare", *map(str, paths)))
+    if out is not None:
+        saved_results.write(comparison, Path(out))
     return comparison
 
 

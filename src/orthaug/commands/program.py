@@ -344,14 +344,14 @@ def other_writes() -> bool:
     return text is not None
 
 
-def arguments(command: str, spec: Path, **options: Any) -> tuple[str, ...]:
+def arguments(command: str, *read: Path, **options: Any) -> tuple[str, ...]:
     """Return the arguments of a command, to run it again: the options that were given, by name.
 
     Examples:
         >>> arguments("fit", Path("a.toml"), out=Path("b"), resume=False, model=None, force=True)
         ('fit', 'a.toml', '--out', 'b', '--force')
     """
-    words = [command, str(spec)]
+    words = [command, *map(str, read)]
     for name, value in options.items():
         if value is True:
             words.append(f"--{name}")

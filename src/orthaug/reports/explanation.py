@@ -40,8 +40,12 @@ def explain_text(result: ExplainResult) -> str:
     if result.terms:
         blocks += [_term_lines(result), _parameter_lines(result)]
     if result.singles:
-        rows = [["share", "added to", "each term alone"]]  # which may be long
-        rows += [[_percent(one.share), one.added_to, one.expression] for one in result.singles]
+        several = len({one.added_to for one in result.singles}) > 1
+        rows = [["share", *["added to"] * several, "each term alone"]]  # which may be long
+        rows += [
+            [_percent(one.share), *[one.added_to] * several, one.expression]
+            for one in result.singles
+        ]
         blocks.append(table(rows))
     if result.memory:
         rows = [["share", "equation", "term with memory in the free run's residual"]]
@@ -59,7 +63,9 @@ def explain_text(result: ExplainResult) -> str:
 
 
 def _term_lines(result: ExplainResult) -> list[str]:
-    rows = [["term", "coefficient", "std", "unit", "share", "alone", "added to"]]
+    several = len({term.added_to for term in result.terms}) > 1
+    head = ["term", "coefficient", "std", "unit", "share", "alone"]
+    rows = [[*head, *["added to"] * several]]
     for term in result.terms:
         std = "–" if term.std is None else f"{term.std:.2g}"
         numbers = (
@@ -69,8 +75,8 @@ def _term_lines(result: ExplainResult) -> list[str]:
             _percent(term.share),
             _percent(term.alone),
         )
-        rows.append([term.expression, *numbers, term.added_to])
-    lines = table(rows, drop=["alone", "unit"])
+        rows.append([term.expression, *numbers, *[term.added_to] * several])
+    lines = table(rows, drop=["alone", "unit", "std"])
     for term in result.terms:
         if term.rivals:
             lines.append(f"nearly as well instead of {term.expression}: {', '.join(term.rivals)}")

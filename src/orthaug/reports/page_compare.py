@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthaug._base.lines import digits_for
+from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Grid, Section, Table, Text, interval, number
 from orthaug.reports.page_figures import parameter_comparison
@@ -19,7 +20,8 @@ from orthaug.reports.page_fit import (
     units_of_result,
 )
 from orthaug.reports.page_runs import compared_plots
-from orthaug.reports.result import CompareResult
+from orthaug.reports.result import CompareResult, DifferenceResult
+from orthaug.reports.text import setting_cell
 
 _WORDS = {
     "helps": "the learner helps",
@@ -53,6 +55,7 @@ def compare_sections(page: ComparePage) -> list[Section]:
         Section("scores", "Scores", score_blocks(scores, page.outputs, units_of_result(result))),
         Section("parameters", "Parameters", _parameters(result)),
         Section("free-run", "Free run", list(compared_plots(page.responses))),
+        Section("settings", "Settings that differ", _settings(result)),
         Section(
             "residuals",
             "Residual tests",
@@ -61,6 +64,7 @@ def compare_sections(page: ComparePage) -> list[Section]:
                 for row in result.comparison
                 if row.residuals is not None
             ],
+            folded=True,
         ),
         Section(
             "warnings",
@@ -72,7 +76,9 @@ def compare_sections(page: ComparePage) -> list[Section]:
                 if w not in result.warnings
             ],
         ),
-        Section("reproduce", "How to reproduce it", origin_blocks(page.origin, result)),
+        Section(
+            "reproduce", "How to reproduce it", origin_blocks(page.origin, result), folded=True
+        ),
     ]
     return [section for section in found if section.blocks]
 
@@ -110,7 +116,11 @@ def _models(result: CompareResult) -> list[Any]:
         "time [s]",
         "verdict",
     ]
-    caption = "Physics alone and every structure on the same data and seeds."
+    caption = (
+        "Physics alone and every structure on the same data and seeds."
+        if result.differences is None
+        else "Saved results of the same data."
+    )
     if result.chosen:
         caption += (
             " The chosen one has the lowest error on the validation part, unless its learner "
@@ -130,6 +140,10 @@ def _parameters(result: CompareResult) -> list[Any]:
         return []
     rows = [(row.name, parameter) for row in result.comparison for parameter in row.parameters]
     biased = any(parameter.bias for _, parameter in rows)
+    apart = {(one.result, one.name): one for one in result.differences or ()}
+    if result.differences is not None:  # the same parameter of every result, side by side
+        names = list(dict.fromkeys(parameter.name for _, parameter in rows))
+        rows.sort(key=lambda row: names.index(row[1].name))
     rows = [
         [
             name,
@@ -139,6 +153,7 @@ def _parameters(result: CompareResult) -> list[Any]:
             number(p.std, 2, p.value),
             interval(p.ci95),
             *([bias_cell(p)] if biased else []),
+            *(_difference_cells(apart.get((name, p.name)), p) if apart else []),
         ]
         for name, p in rows
     ]
@@ -150,6 +165,31 @@ def _parameters(result: CompareResult) -> list[Any]:
         "standard error",
         "95 % interval",
         *(["bias"] if biased else []),
+        *([f"less {result.comparison[0].name}", "in standard errors"] if apart else []),
     ]
     caption = f"What each model estimates.{BIAS_TOLD if biased else ''}"
+    if apart:
+        caption += (
+            " Differences are from the first model, also over the larger standard error of both: a "
+            "size and no test, because both estimates have the same noise in them."
+        )
     return [Grid(parameter_comparison(result.comparison)), Table(caption, head, rows)]
+
+
+def _difference_cells(one: DifferenceResult | None, parameter: ParameterResult) -> list[str]:
+    """Return the difference of a parameter from the first model, and its size."""
+    if one is None:
+        return ["–", "–"]
+    return [number(one.value, 3, parameter.value), number(one.of_std, 2)]
+
+
+def _settings(result: CompareResult) -> list[Any]:
+    """Return the keys in which the specs of saved results differ."""
+    if not result.settings:
+        return []
+    names = [row.name for row in result.comparison]
+    rows = [
+        [one.key, *(setting_cell(one.values[name]) for name in names)] for one in result.settings
+    ]
+    caption = "Keys of the specs whose values differ; a dash where the default holds."
+    return [Table(caption, ["setting", *names], rows)]

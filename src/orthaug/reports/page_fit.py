@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.lines import digits_for
+from orthaug.analysis.findings import MotionFitResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.fitting.estimates import STD_KINDS
 from orthaug.models.response import Response
@@ -254,37 +255,7 @@ def _parameter_cells(row: ParameterResult, biased: bool, shared: bool) -> list[s
 
 def _equations(result: FitResult) -> list[Any]:
     """Return the equations of a motion, and the terms that were learned."""
-    blocks: list[Any] = []
-    declared = result.spec.get("motion")
-    if result.motion is not None and declared and "states" in declared:
-        next_value = result.motion.discrete
-        rows = [
-            [
-                state,
-                given.get("unit") or "–",
-                given.get("next") or given.get("derivative") or "–",
-                "yes" if given.get("learned") else "no",
-            ]
-            for state, given in declared["states"].items()
-        ]
-        text = result.motion
-        caption = (
-            f"The equations of motion, {text.integrator} with {text.substeps} "
-            f"substep{'s' * (text.substeps > 1)} in a sample and a {text.hold} hold; a "
-            f"prediction starts from a state estimated over {text.window} rows."
-        )
-        blocks.append(
-            Table(
-                caption,
-                [
-                    "state",
-                    "unit",
-                    "next value" if next_value else "derivative",
-                    "learner beside it",
-                ],
-                rows,
-            )
-        )
+    blocks = [] if result.motion is None else _motion_blocks(result.motion, result.spec)
     if result.terms:
         rows = [
             [
@@ -311,6 +282,61 @@ def _equations(result: FitResult) -> list[Any]:
     if result.equation:
         blocks.append(Code(result.equation.text, "The fitted equations"))
     return blocks
+
+
+def _motion_blocks(motion: MotionFitResult, spec: Mapping[str, Any]) -> list[Any]:
+    """Return the equations of a motion or the file that has them, and the controller of a loop."""
+    declared, controller = spec.get("motion") or {}, spec.get("controller")
+    integration = (
+        f"{motion.integrator} with {motion.substeps} substep{'s' * (motion.substeps > 1)} in a "
+        f"sample and a {motion.hold} hold; a prediction starts from a state estimated over "
+        f"{motion.window} rows."
+    )
+    blocks: list[Any] = []
+    if "states" in declared:
+        rows = [
+            [
+                state,
+                given.get("unit") or "–",
+                given.get("next") or given.get("derivative") or "–",
+                "yes" if given.get("learned") else "no",
+            ]
+            for state, given in declared["states"].items()
+        ]
+        value = "next value" if motion.discrete else "derivative"
+        head = ["state", "unit", value, "learner beside it"]
+        blocks.append(Table(f"The equations of motion, {integration}", head, rows))
+    elif declared.get("source"):
+        source = declared["source"]
+        beside = ", ".join(source.get("learned") or ()) or "no state"
+        blocks.append(
+            Text(
+                f"The equations of motion are those of `{source.get('file')}`, with the states "
+                f"{', '.join(motion.states)}; the learner is beside {beside}. They are integrated "
+                f"by {integration}",
+                "note",
+            )
+        )
+    if controller:
+        blocks.append(Text(_controller_text(controller), "note"))
+    return blocks
+
+
+def _controller_text(controller: Mapping[str, Any]) -> str:
+    """Return a sentence on the controller that a motion is simulated with."""
+    if controller.get("outputs"):
+        equations = {**(controller.get("define") or {}), **controller["outputs"]}
+        law = ", ".join(f"`{name} = {given}`" for name, given in equations.items())
+        next_values = {name: one["next"] for name, one in (controller.get("states") or {}).items()}
+        law += "".join(f", next `{name} = {given}`" for name, given in next_values.items())
+        return f"The loop is simulated with its controller: {law}."
+    keys = ("Kp", "Ki", "Kd", "filter", "numerator", "denominator")
+    law = ", ".join(f"{key} = {controller[key]}" for key in keys if controller.get(key))
+    error = f"{controller.get('reference') or '0'} − {controller.get('measured') or 'the output'}"
+    return (
+        f"The loop is simulated with its controller, which sets {controller.get('output')} from "
+        f"{error}: {law}."
+    )
 
 
 def _runs(page: FitPage) -> list[Any]:

@@ -98,13 +98,15 @@ def _comparison_plot(part: str, runs: Mapping[str, Response], most: int) -> Plot
                     "series": key,
                     "name": "measured",
                     "line": {"color": "@measured", "width": 3},
+                    "envelope": "area",
                 }
             )
         colors = ("@physics", "@model", "@learner", "@bias") * 9
         for (name, model), color, dash in zip(models.items(), colors, _DASHES * 9, strict=False):
             line = {"color": color, "width": 1.3, "dash": dash}
             given = {"name": name, "legendgroup": name, "line": line}
-            panels.traces.append({**own, **given, "series": panels.keep(name, i, model)})
+            drawn = {"series": panels.keep(name, i, model), "envelope": "outline"}
+            panels.traces.append({**own, **given, **drawn})
             if panels.measured is not None:
                 panels.add_residual(name, i, model, given)
         panels.finish(i, models)

@@ -19,6 +19,8 @@ _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
 _SURE = 0.1  # standard error over value up to which a parameter counts as known
 _NAMED = 0.5  # share of the learned part from which its cause is the first advice
+_AGREES = 1.0  # standard errors up to which parameters of two results are called the same
+_MOST_KEYS = 4  # of settings in a sentence
 _MOST_DOUBTS = 3  # in the first sentence
 _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
@@ -108,6 +110,8 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     trust += f"; {_quote_names(near)} {_verb_for(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
+    if result.differences is not None:
+        return PageVerdict(level, trust, _agreement(result), _settings_text(result))
     alone = errors.get("physics alone")
     use = "This is physics alone: no learner improves on it."
     if best != "physics alone" and alone is not None and error is not None:
@@ -118,6 +122,34 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         )
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
+
+
+def _agreement(result: CompareResult) -> str:
+    """Return how far the parameters of saved results are from each other."""
+    sizes = [one for one in result.differences or () if one.of_std is not None]
+    if not sizes:
+        return "No parameter has a standard error, so nothing says how near the parameters are."
+    far = max(sizes, key=lambda one: abs(one.of_std or 0.0))
+    row = next(row for row in result.comparison if row.name == far.result)
+    unit = next((p.unit for p in row.parameters if p.name == far.name), "")
+    shown = f"{number(far.value, 3)} {unit}".rstrip()
+    text = (
+        f"the largest difference is that of “{far.name}” between “{result.comparison[0].name}” and "
+        f"“{far.result}”, {shown} or {number(abs(far.of_std or 0.0), 2)} standard errors"
+    )
+    if abs(far.of_std or 0.0) <= _AGREES:
+        return f"The parameters agree within one standard error: {text}."
+    return f"The parameters differ: {text}."
+
+
+def _settings_text(result: CompareResult) -> str:
+    """Return the settings to which a difference between saved results may be due."""
+    keys = [one.key for one in result.settings or ()]
+    if not keys:
+        return "Their settings are the same."
+    more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+    shown = ", ".join(f"`{key}`" for key in keys[:_MOST_KEYS])
+    return f"They differ in {shown}{more}; change one at a time to see what makes the difference."
 
 
 def _best_model(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:

@@ -144,14 +144,41 @@ class RowResult(Content):
     validation: ValidationResult | None
 
 
+class DifferenceResult(Content):
+    """The difference of a parameter: that of a saved result less that of the first one."""
+
+    name: str
+    result: str
+    """The name of the other row."""
+    value: Number
+    of_std: Number
+    """The difference over the larger of both standard errors; None where there is none."""
+
+
+class SettingResult(Content):
+    """A key of the spec in which saved results differ, with its value by the name of the row."""
+
+    key: str
+    values: dict[str, Any]
+    """None where the spec does not have the key, and its default holds."""
+
+
 class CompareResult(ResultHeader):
-    """The result of `orthaug compare`."""
+    """The result of `orthaug compare`: of a spec, or of saved results.
+
+    Of saved results `spec` is that of the first one, and `data` are the parts that all have.
+    """
+
+    absent: ClassVar = frozenset({"differences", "settings"})
 
     spec: dict[str, Any]
     data: DataResult
     comparison: list[RowResult]
     chosen: str | None
     left_out: dict[str, str]
+    differences: list[DifferenceResult] | None = None
+    """Of every parameter that a saved result shares with the first one."""
+    settings: list[SettingResult] | None = None
     warnings: list[Warning]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import numpy as np
 from orthaug._base.errors import Warning
 from orthaug._base.lines import (
     INTERVAL_HEAD,
+    cut,
     estimate_cells,
     estimate_rows,
     fold,
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 
 SHOWN = 8  # signals of a design that are listed
 NOISE_ONLY = "95 %, noise only"  # head of intervals that do not count missing physics
+_LONGEST_SETTING = 30  # characters of a cell
+_LONGEST_SIGNAL = 44  # characters of the name of a design: beside its numbers on 80 columns
 ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
@@ -149,11 +153,16 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Return two tables, parameters with standard errors and scores on every part.
 
-    The verdicts on each row follow.
+    The verdicts on each row follow. Of saved results the parameters have intervals and differences,
+    and the settings that differ are a third table.
     """
-    lines = [*table(_parameter_cells(result)), "", *_score_table(result.comparison)]
+    saved = result.differences is not None
+    what = "result" if saved else "structure"
+    lines = _difference_lines(result) if saved else table(_parameter_cells(result))
+    lines += ["", *_score_table(result.comparison, what)]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
+    lines += ["", *_setting_lines(result)] if saved else []
     parts = [
         f"{row.name}: {row.residuals.text}"
         for row in result.comparison
@@ -162,6 +171,10 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines += ["", *parts] if parts else []
     parts = [f"{kind}: {verdict.summary}" for kind, verdict in verdicts.items()]
     beyond = dict.fromkeys(f"{e}." for verdict in verdicts.values() for e in verdict.extrapolation)
+    if saved:
+        parts = [
+            f"{row.name}: {row.validation.text}" for row in result.comparison if row.validation
+        ]
     lines += ["", *parts, *beyond] if parts else []
     lines.append("")
     lines += [f"left out: {kind}: {why}" for kind, why in result.left_out.items()]
@@ -171,6 +184,46 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
             f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings
         ]
     return "\n".join(fold(lines)).rstrip()
+
+
+def _difference_lines(result: CompareResult) -> list[str]:
+    """Return a row for each parameter of each saved result, with its difference from the first."""
+    rows, first = result.comparison, result.comparison[0].name
+    found = {(one.name, one.result): one for one in result.differences or ()}
+    cells = [
+        ["parameter", "result", "value", "std", INTERVAL_HEAD, f"less {first}", "of std", "unit"]
+    ]
+    for name in dict.fromkeys(p.name for row in rows for p in row.parameters):
+        own = {row.name: p for row in rows for p in row.parameters if p.name == name}
+        shown = estimate_rows((p.value, p.std, p.profile95 or p.ci95) for p in own.values())
+        for number, (row, p, estimate) in enumerate(zip(own, own.values(), shown, strict=True)):
+            other = found.get((name, row))
+            apart = (
+                ["–", "–"] if other is None else [_signed(other.value), _signed(other.of_std, 2)]
+            )
+            star = " *" if row == result.chosen else ""
+            cells.append(["" if number else name, row + star, *estimate, *apart, p.unit])
+    return table(cells, drop=["std", "unit"])
+
+
+def _signed(value: float | None, digits: int = 3) -> str:
+    return "–" if value is None else plain_number(value, digits, sign="+")
+
+
+def _setting_lines(result: CompareResult) -> list[str]:
+    """Return the settings in which saved results differ; a dash where the default holds."""
+    if not result.settings:
+        return ["The settings are the same."]
+    names = [row.name for row in result.comparison]
+    rows = [
+        [one.key, *(setting_cell(one.values[name]) for name in names)] for one in result.settings
+    ]
+    return table([["setting", *names], *rows])
+
+
+def setting_cell(value: object) -> str:
+    """Return a value of a spec as a cell: as TOML has it, cut; a dash for none."""
+    return "–" if value is None else cut(json.dumps(value, ensure_ascii=False), _LONGEST_SETTING)
 
 
 def split_text(result: SplitResult) -> str:
@@ -199,7 +252,10 @@ def design_text(result: DesignResult) -> str:
     for signal in result.candidates[:SHOWN]:
         error = None if signal.cost is None else float(np.sqrt(signal.cost))
         rows.append(
-            [signal.name, *map(_or_infinite, (error, signal.bias, signal.std, signal.condition))]
+            [
+                cut(signal.name, _LONGEST_SIGNAL),
+                *map(_or_infinite, (error, signal.bias, signal.std, signal.condition)),
+            ]
         )
     lines = [
         f"input       {result.kind}",
@@ -395,8 +451,8 @@ def _parameter_cells(result: CompareResult) -> list[list[str]]:
     return rows
 
 
-def _score_table(rows: Sequence[RowResult]) -> list[str]:
-    cells = [["structure", "part", "one-step NRMSE", "free-run NRMSE", "free-run FIT %"]]
+def _score_table(rows: Sequence[RowResult], what: str) -> list[str]:
+    cells = [[what, "part", "one-step NRMSE", "free-run NRMSE", "free-run FIT %"]]
     for row in rows:
         for part, scores in row.scores.items():
             shown = (scores.prediction.nrmse, scores.simulation.nrmse, scores.simulation.fit)
