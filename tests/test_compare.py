@@ -205,3 +205,14 @@ def test_a_saved_model_of_other_inputs_is_refused_before_training(compared, tmp_
     assert done.code == 2 and done.err.count("\n") == 1
     assert str(model) in done.err and "force" in done.err
     assert not (tmp_path / "out").exists()
+
+
+def test_by_default_a_comparison_stands_beside_the_fit(project):
+    """It has no model, and would take that of the fit away."""
+    fit, beside = Path("orthaug-out") / project.stem, f"{project.stem}-comparison"
+    assert run("fit", project).code == 0
+    model = listing(fit / "model")
+    done = run("compare", project)
+    assert done.code == 0 and f"written to {Path('orthaug-out') / beside}" in done.out
+    assert listing(fit / "model") == model
+    assert (fit.with_name(beside) / "result.json").is_file()

@@ -143,7 +143,11 @@ def compare(
         ),
     ],
     out: Annotated[
-        Path | None, out_folder("orthaug-out/SPEC; of results orthaug-out/comparison")
+        Path | None,
+        out_folder(
+            "orthaug-out/SPEC, or orthaug-out/SPEC-comparison beside a fit; of results "
+            "orthaug-out/comparison"
+        ),
     ] = None,
     model: Annotated[
         list[Path] | None,
@@ -169,7 +173,7 @@ def compare(
     from orthaug.reports.text import compare_text
 
     spec = what[0]
-    folder = out or Path("orthaug-out") / spec.stem
+    folder = out or _beside_fit(Path("orthaug-out") / spec.stem)
     check_folder(folder, force=force)
     job = open_job(spec)
     check_inputs_kept(job, folder, model or ())
@@ -186,6 +190,12 @@ def compare(
     print_result(
         comparison.result, compare_text(comparison.result, comparison.verdicts), as_json, folder
     )
+
+
+def _beside_fit(folder: Path) -> Path:
+    """Return the folder, or one beside it where it holds the model of a fit."""
+    kept = os.path.isdir(folder / "model")
+    return folder.with_name(f"{folder.name}-comparison") if kept else folder
 
 
 def _compare_results(
