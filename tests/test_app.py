@@ -160,7 +160,7 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
         "one": {"files": ["../c.csv"]},
         "new": {"files": ["d.csv"]},
     }
-    moving = tomllib.loads(spec_text.as_motion(SPEC))
+    moving = tomllib.loads(spec_text.with_physics(SPEC, "motion", {}))
     assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
     with pytest.raises(InputError, match="broken TOML"):
         spec_text.plain("[data\n")
@@ -171,7 +171,7 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     write_csv(tmp_path / "run.csv", **{"Force (N)": u, "Position (mm)": y})
     assert run("init", tmp_path / "run.csv", "--inputs", "Force (N)", "--outputs", "Position (mm)",
                "--out", tmp_path / "spec.toml").code == 0  # fmt: skip
-    moving = spec_text.as_motion((tmp_path / "spec.toml").read_text())
+    moving = spec_text.with_physics((tmp_path / "spec.toml").read_text(), "motion", {})
     motion = tomllib.loads(moving)["motion"]
     assert {name: row["unit"] for name, row in motion["parameters"].items()} == {
         **{"m": "N s²/mm", "c": "N s/mm", "k": "N/mm"}
@@ -180,9 +180,47 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     for stale in ("difference equations", "lags", "trains on the free run"):
         assert stale not in moving
     assert "# Every key" in moving  # what is still true stays
-    metres = spec_text.as_motion((tmp_path / "spec.toml").read_text().replace('"mm"', '"m"'))
+    written = (tmp_path / "spec.toml").read_text().replace('"mm"', '"m"')
+    metres = spec_text.with_physics(written, "motion", {})
     assert tomllib.loads(metres)["motion"]["parameters"]["m"]["unit"] == "kg"
-    assert "unit" not in spec_text.as_motion(SPEC)
+    assert "unit" not in spec_text.with_physics(SPEC, "motion", {})
+
+
+def test_the_other_kind_of_physics_is_kept_and_comes_back():
+    shelf: spec_text.Shelf = {}
+    moving = spec_text.with_physics(SPEC, "motion", shelf)
+    heavy = spec_text.with_value(moving, ("motion", "parameters", "m", "initial"), 7.0)
+    back = spec_text.with_physics(heavy, "terms", shelf)
+    assert tomllib.loads(back) == tomllib.loads(SPEC)
+    again = spec_text.with_physics(back, "motion", shelf)
+    assert tomllib.loads(again) == tomllib.loads(heavy)
+    fresh = tomllib.loads(spec_text.with_physics(moving, "terms", {}))  # a spec of motions alone
+    regressors = [term["regressor"] for term in fresh["baseline"]["terms"]]
+    assert regressors == ["y[k-1]", "u[k-1]"] and "motion" not in fresh
+
+
+def test_every_change_of_the_spec_is_undone_and_redone(started):
+    async def worked() -> None:
+        session = started()
+        for text in ("a = 1", "a = 2"):
+            session.write(text, "form")
+        session.write("a = 23", "editor")
+        session.write("a = 234", "editor")  # typed in one go
+        session.undo()
+        assert session.spec == "a = 2"
+        session.undo()
+        session.undo()  # the first spec stays
+        assert session.spec == "a = 1" and session.earlier == []
+        session.redo()
+        session.redo()
+        assert session.spec == "a = 234"
+        session.undo()
+        session.write("a = 5", "form")
+        session.redo()
+        assert session.spec == "a = 5"
+        await session.close()
+
+    asyncio.run(worked())
 
 
 def trained_on(folder: Path, pattern: str) -> list[str]:
@@ -483,6 +521,7 @@ def looked(**given: Any) -> dict[str, Any]:
         "step": None,
         "account": "",
         "open": "",
+        "guess": "",
     }
     return plain | {"spec": None} | given
 
@@ -1183,7 +1222,7 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
     # the parts stand in the history of the browser
     tab.go("Model")
     page.wait_for_function("location.hash === '#Model'")
-    page.get_by_role("button", name="Write equations").click()
+    page.get_by_label("written as").select_option("motion")
     page.wait_for_selector("text=No unit is given for m, c, k")
     page.go_back()
     page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Data')")

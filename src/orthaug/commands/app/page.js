@@ -93,3 +93,10 @@ function shown(part, first) {
 addEventListener("popstate", () => {
   if (location.hash) emitEvent("part", location.hash.slice(1));
 });
+
+// Undo and redo of the spec; in a field the keys are those of its own text.
+addEventListener("keydown", (event) => {
+  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z" || event.target.closest("input, textarea")) return;
+  event.preventDefault();
+  emitEvent(event.shiftKey ? "redo" : "undo");
+});

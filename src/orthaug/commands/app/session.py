@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 import zipfile
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
@@ -24,6 +25,7 @@ from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
 from orthaug.commands.app.processes import Command, WorkerPool
 from orthaug.commands.app.spec_text import (
+    Shelf,
     absolute,
     files,
     in_file,
@@ -31,12 +33,14 @@ from orthaug.commands.app.spec_text import (
     kept_title,
     plain,
     section,
+    with_physics,
     with_value,
 )
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
+_TYPING = 2.0  # s between two changes in the editor that are undone together
 KINDS = ("fit", "compare")
 
 
@@ -65,6 +69,13 @@ class Session:
         """The title under which its spec is kept when the server ends; empty until there is
         something to keep.
         """
+        self.undone: list[str] = []
+        """Specs that redo brings back, the next one last."""
+        self.earlier: list[str] = []
+        """Specs that undo brings back, the next one last."""
+        self.shelf: Shelf = {}
+        """By kind of physics, what the spec had of it before another kind took its place."""
+        self._typed = 0.0
         self.authors: list[str] = []
         """Author of each change of the spec: a part of a page, which ignores its own changes."""
         self.checked: dict[str, Any] | None = None
@@ -118,6 +129,20 @@ class Session:
             else "Choose the channels in Data first."
         )
 
+    def missing(self, part: str) -> str:
+        """Return what is missing before a part of the page is done; empty where nothing is."""
+        if not self.spec.strip():
+            return self.first_step
+        if part == "Model" and self.checking:
+            return "The spec is being checked."
+        if part == "Model" and self.refused:
+            return "The spec cannot be trained yet: Check says why."
+        if part in ("Training", "Report") and self.running is not None:
+            return "Training is still running."
+        if part in ("Training", "Report") and not self.results:
+            return "Nothing has been trained yet."
+        return ""
+
     # Data
 
     def place_for(self, name: str) -> Path:
@@ -170,6 +195,23 @@ class Session:
         self._look_again(None, None, None)
         if self.spec.strip():  # it may name this file
             self._check_soon()
+
+    def try_example(self) -> None:
+        """Begin with the records and the spec of the built-in example."""
+        self.start(self._make_example())
+
+    async def _make_example(self) -> None:
+        self.looking, self.trouble = "Writing the records …", ""
+        self.mark_changed("data")
+        try:
+            spec = (await self.desk.ask("example", folder=self.folder))["spec"]
+        except InputError as error:
+            self.looking, self.trouble = "", self.reword(error)
+            self.mark_changed("data")
+            return
+        self.title = "mass, spring and damper"
+        self.write(spec, "example")
+        self.open_file(self.folder / "train.csv")
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
         """Begin the spec anew with these columns."""
@@ -265,6 +307,29 @@ class Session:
         """Take a new text of the spec; check it when it has not changed for a moment."""
         if text == self.spec:
             return
+        now = time.monotonic()
+        typing = author == "editor" and now - self._typed < _TYPING
+        self._typed = now if author == "editor" else 0.0
+        if self.spec.strip() and not (typing and self.earlier):
+            self.earlier.append(self.spec)
+        self.undone.clear()
+        self._take(text, author)
+
+    def undo(self) -> None:
+        """Take back the last change of the spec."""
+        self._go(self.earlier, self.undone)
+
+    def redo(self) -> None:
+        """Make the change again that was taken back last."""
+        self._go(self.undone, self.earlier)
+
+    def _go(self, there: list[str], back: list[str]) -> None:
+        if there:
+            back.append(self.spec)
+            self._typed = 0.0
+            self._take(there.pop(), "history")
+
+    def _take(self, text: str, author: str) -> None:
         self.spec = text
         self.authors.append(author)
         self.mark_changed("spec")
@@ -276,6 +341,10 @@ class Session:
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
         """Replace the spec by the result of a function of `spec_text` with these arguments."""
         self.write(change(self.spec, *given), author)
+
+    def choose_physics(self, kind: str) -> None:
+        """Write the physics as `terms` or as equations of `motion`; the other kind is kept."""
+        self.edit("physics", with_physics, kind, self.shelf)
 
     def _check_soon(self) -> None:
         if self._check is not None:

@@ -295,6 +295,12 @@ _OF_TERMS = (
     'focus = "simulation"',
 )
 """Phrases of comments by `orthaug init` that do not hold for equations of motion."""
+TERM = """
+[[baseline.terms]]
+parameter = "{parameter}"
+regressor = "{regressor}"
+output = "{output}"
+"""
 MOTION = """
 [motion]
 [motion.states]
@@ -310,15 +316,59 @@ k = {{ initial = 1.0{k}, min = 0 }}
 """
 
 
-def as_motion(text: str) -> str:
-    """Return the spec with the equations of a mass, spring and damper in place of the baseline.
+Shelf = dict[str, dict[tuple[str, ...], Any]]
+"""By kind of physics, what a spec had under each path before another kind took its place."""
+_OF_PHYSICS = (
+    *(("baseline",), ("lags",), ("physics",), ("suspects",), ("motion",), ("learner", "inputs")),
+    *(("learner", "terms"), ("training", "focus")),
+)
+"""What of a spec belongs to one kind of physics alone."""
 
-    The user is to change them.
 
-    Comments on the baseline are removed; parameters get units where force and output have units.
+def kind_of_physics(content: Mapping[str, Any]) -> str:
+    """Return the kind of physics of a spec: `terms`, `motion` or `source`."""
+    if section(content, "physics", "source"):
+        return "source"
+    return "motion" if "motion" in content else "terms"
+
+
+def with_physics(text: str, kind: str, shelf: Shelf) -> str:
+    """Return the spec with `terms` or equations of `motion` as its physics.
+
+    What it has of the present kind is put on the shelf; what lies there of the other is taken.
+    Without it the equations are those of a mass, spring and damper, which the user is to change,
+    with units where force and output have them.
     """
+    present = kind_of_physics(plain(text))
+    if kind == present:
+        return text
+    taken: dict[tuple[str, ...], Any] = {}
+    known = shelf.get(kind) or _first_physics(text, kind)
+
+    def change(document: Any) -> None:
+        for *above, key in _OF_PHYSICS:
+            table = section(document, *above) if above else document
+            if key in table:
+                taken[(*above, key)] = table.pop(key)  # pyright: ignore[reportAttributeAccessIssue]
+        for path, value in known.items():
+            _make_table(document, path[:-1])[path[-1]] = value
+
+    made = edit_text(_without_comments(text, _OF_TERMS), change)
+    shelf[present] = taken
+    return made
+
+
+def _first_physics(text: str, kind: str) -> dict[tuple[str, ...], Any]:
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
+    if kind == "terms":
+        rows = [
+            TERM.format(parameter=f"p{i}", regressor=regressor, output=output)
+            for i, (output, regressor) in enumerate(
+                ((output, f"{name}[k-1]") for output in outputs for name in (output, inputs[0])), 1
+            )
+        ]
+        return {("baseline",): tomlkit.parse("".join(rows))["baseline"]}
     force, output = (
         section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0])
     )
@@ -326,16 +376,8 @@ def as_motion(text: str) -> str:
         _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
     )
     given = {name: f', unit = "{units[name]}"' if name in units else "" for name in "xvmck"}
-
-    def change(document: Any) -> None:
-        for key in ("baseline", "lags", "physics", "motion", "suspects"):
-            document.pop(key, None)
-        document["motion"] = tomlkit.parse(
-            MOTION.format(output=outputs[0], force=inputs[0], **given)
-        )["motion"]
-        _make_table(document, ["learner"])["inputs"] = ["v"]
-
-    return edit_text(_without_comments(text, _OF_TERMS), change)
+    written = MOTION.format(output=outputs[0], force=inputs[0], **given)
+    return {("motion",): tomlkit.parse(written)["motion"], ("learner", "inputs"): ["v"]}
 
 
 def _without_comments(text: str, phrases: Sequence[str]) -> str:

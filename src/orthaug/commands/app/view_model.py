@@ -26,6 +26,7 @@ from orthaug.commands.app.widgets import (
 )
 
 _TERMS = ("baseline", "terms")
+_PHYSICS = {"terms": "a sum of terms", "motion": "equations of motion"}
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
 _MULTIPLE = 1e5  # % from which a change is given in words
@@ -92,10 +93,12 @@ class ModelView:
                 begin = self.session.first_step.removesuffix(".")
                 text(f"{begin}, or write a spec in the field below.", "p", "hint")
                 return
-            if "motion" in content:
+            source, kind = _source_of(content), spec_text.kind_of_physics(content)
+            if not source:
+                choice("written as", _PHYSICS, kind, self.session.choose_physics)
+            if kind == "motion":
                 self._draw_motion(content)
                 return
-            source = _source_of(content)
             if source:
                 where = f"{source.get('kind', 'source')} {source.get('file', '')}".strip()
                 words = f"Physics from a file ({where}), written in the spec below."
@@ -109,9 +112,7 @@ class ModelView:
             )
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
-            with ui.element("div").classes("fields"):
-                button("Add a term", self._add)
-                button("Write equations of motion instead", self._to_motion)
+            button("Add a term", self._add)
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
@@ -138,10 +139,6 @@ class ModelView:
         row = {"parameter": name, "regressor": f"{[*inputs, *outputs, 'u'][0]}[k-1]**2"}
         row |= {"output": outputs[0]} if len(outputs) > 1 else {}
         self.session.edit("more terms", spec_text.with_row, _TERMS, row)
-
-    def _to_motion(self) -> None:
-        self.session.edit("motion", spec_text.as_motion)
-        ui.notify("A mass, a spring and a damper: change the equations in the spec below.")
 
     def _draw_motion(self, content: Mapping[str, Any]) -> None:
         motion = spec_text.section(content, "motion")

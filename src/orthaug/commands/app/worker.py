@@ -109,17 +109,20 @@ def look(
         "spec": None,
         "account": "",
         "open": "",
+        "guess": "",
     }
     try:
         given = None if step is None else check_step(step)
-        roles = starting.assign(found, inputs, outputs, given, guess=False)  # the page asks
+        roles = starting.assign(found, inputs, outputs, given)
         if roles is not None:
-            draft = starting.draft(found, roles, Path(out))
-            names = {
+            answer |= {
                 "inputs": [c.header for c in roles.inputs],
                 "outputs": [c.header for c in roles.outputs],
+                "guess": roles.reason,  # which a person is to confirm before there is a spec
             }
-            answer |= {"spec": draft.spec, "account": draft.account, **names}
+        if roles is not None and not roles.reason:
+            draft = starting.draft(found, roles, Path(out))
+            answer |= {"spec": draft.spec, "account": draft.account}
     except InputError as error:
         answer["open"] = str(error).removeprefix(f"{path}: ")
     return answer | {"curves": _curves(found)}
@@ -146,7 +149,7 @@ def _column(found: Survey, column: Column) -> dict[str, Any]:
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
     own = {
         "header": column.header,
-        "kind": column.kind,
+        "kind": column.proposed,
         "usable": usable,
         "timed": column is found.clock.column,
     }
@@ -196,6 +199,15 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
         "prepared": [done.text for done in job.train.record.prepared],
         "curves": _prepared_curves(job),
     }
+
+
+def example(folder: str) -> dict[str, Any]:
+    """Write the records of the built-in example into a folder; return its spec."""
+    from orthaug.commands import demo
+    from orthaug.studies.synthetic import mass_spring_damper
+
+    demo.write_records(mass_spring_damper(), Path(folder))
+    return {"spec": demo.SPEC}
 
 
 def verdict(path: str, kind: str) -> dict[str, Any]:
@@ -276,6 +288,7 @@ def _plain(values: Vector) -> list[float | None]:
 QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "look": look,
     "examine": examine,
+    "example": example,
     "verdict": verdict,
 }
 
