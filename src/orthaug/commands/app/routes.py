@@ -68,14 +68,14 @@ class Page:
                 self.undo = button("Undo", self.session.undo).props("aria-keyshortcuts=Control+Z")
                 self.redo = button("Redo", self.session.redo)
                 self.redo.props("aria-keyshortcuts=Control+Shift+Z")
+        start = "Training" if self.session.commands else "Data"
         with (
-            ui.tabs()
+            ui.tabs(value=start)  # a value that comes later would count as a change of the part
             .props("no-caps align=left active-color=tab indicator-color=tab dense")
             .classes("tabs") as tabs
         ):
             for name in _PARTS:
                 ui.tab(name)
-        start = "Training" if self.session.commands else "Data"
         self._keep_history(tabs, start)
         parts = (self.data, self.model, self.training, self.report, self.export)
         with ui.tab_panels(tabs, value=start).props("animated=false").classes("parts"):
@@ -173,7 +173,7 @@ class Page:
             if isinstance(error, InputError)
             else f"this did not work ({type(error).__name__})."
         )
-        ui.notify(sentence(message), type="negative")
+        ui.notify(sentence(message).replace("`", ""), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:

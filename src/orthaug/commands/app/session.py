@@ -132,7 +132,8 @@ class Session:
     def missing(self, part: str) -> str:
         """Return what is missing before a part of the page is done; empty where nothing is."""
         if not self.spec.strip():
-            return self.first_step
+            begin = part == "Data" and self.found is not None
+            return "Begin with the channels first." if begin else self.first_step
         if part == "Model" and self.checking:
             return "The spec is being checked."
         if part == "Model" and self.refused:

@@ -365,12 +365,17 @@ class DataView:
         prepared = {} if checked is None else checked["curves"]
         whole, raw = self._whole_file()
         cleaned = bool(checked and checked["prepared"])
+        step = spec_text.section(session.content(), "data").get("sampling_time")
+        step = step if isinstance(step, int | float) else 1.0
         rows = []
         shown = [curve["column"] for curve in prepared.values()] or list(raw)
         for name in shown:
-            drawn = (
-                [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
-            )
+            drawn = []
+            if name in raw:
+                x = raw[name]["x"]
+                if raw[name].get("untimed"):  # its sampling time stands in the spec alone
+                    x = [step * count for count in x]
+                drawn = [{**raw[name], "x": x, "name": "as measured", "raw": bool(prepared)}]
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:

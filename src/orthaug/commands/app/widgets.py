@@ -29,12 +29,13 @@ def label_widget(element: Drawn, label: str) -> Drawn:
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     """Return an element with text that is never read as HTML."""
-    return ui.html(_unbreakable_lags(what), sanitize=False, tag=tag).classes(classes)
+    return ui.html(marked(what), sanitize=False, tag=tag).classes(classes)
 
 
-def _unbreakable_lags(what: Any) -> str:
-    """Return escaped text in which no line breaks at the minus of a lag."""
-    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
+def marked(what: Any) -> str:
+    """Return escaped text: `names` as code, and no line breaks at the minus of a lag."""
+    lines = re.sub(r"`([^`\n]+)`", r"<code>\1</code>", escape(str(what)))
+    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", lines)
 
 
 def sentence(message: str) -> str:
@@ -45,8 +46,6 @@ def sentence(message: str) -> str:
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """Return a section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
-    if "sticky" in classes:  # it scrolls by itself, by keys too
-        label_widget(section.props("tabindex=0 role=region"), title)
     with section:
         text(title, "h2")
         if hint:
@@ -79,7 +78,7 @@ def field(
 
 def refuse(made: ui.input, why: str) -> None:
     """Show an error under a field."""
-    made.props["error"], made.props["error-message"] = bool(why), why
+    made.props["error"], made.props["error-message"] = bool(why), why.replace("`", "")
     made.update()
 
 
@@ -120,12 +119,12 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
     ]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        lines.append(f"<tr><th scope='row'>{_unbreakable_lags(row[0])}</th>")
+        lines.append(f"<tr><th scope='row'>{marked(row[0])}</th>")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
             lines.append(
                 f"<td class='{kind}' data-label='{escape(name, True)}'>"
-                f"{_unbreakable_lags(value)}</td>"
+                f"{marked(value)}</td>"
             )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")

@@ -162,9 +162,10 @@ def _curves(found: Survey) -> dict[str, Any]:
     for column in found.signals[:_DRAWN]:
         values = column.values[: column.filled]
         time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
-        if time is None or len(time) < len(values) or not np.isfinite(time).all():
+        counted = time is None or len(time) < len(values) or not np.isfinite(time).all()
+        if counted:
             time = step * np.arange(len(values))
-        curves[column.header] = thin_curve(time, values)
+        curves[column.header] = thin_curve(time, values) | {"untimed": counted and not found.clock.step}
     return curves
 
 
