@@ -1234,15 +1234,15 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
 def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / name)
     for i in range(25):
-        spec_text.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
+        spec_text.keep(spec_text.kept_name("rig.csv", f"{i:012d}"[::-1]), f"restarts = {i}")
         os.utime(spec_text.earlier()[0], (i, i))
-    spec_text.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
+    spec_text.keep(spec_text.kept_name("rig.csv", f"{24:012d}"[::-1]), "restarts = 99")
     kept = spec_text.earlier()
     assert len(kept) == 20 and kept[0].read_text() == "restarts = 99"
     assert {spec_text.kept_title(place) for place in kept} == {"rig.csv"}
     assert [file.suffix for file in kept[0].parent.iterdir()] == [".toml"] * 20
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: kept[0])  # no folder
-    spec_text.keep("rig.csv", "key", "restarts = 1")
+    spec_text.keep("rig.csv-key", "restarts = 1")
     assert spec_text.earlier() == []
 
 

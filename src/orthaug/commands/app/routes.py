@@ -68,7 +68,7 @@ class Page:
                 self.undo = button("Undo", self.session.undo).props("aria-keyshortcuts=Control+Z")
                 self.redo = button("Redo", self.session.redo)
                 self.redo.props("aria-keyshortcuts=Control+Shift+Z")
-        start = "Training" if self.session.commands else "Data"
+        start = "Training" if self.session.commands or self.session.shown else "Data"
         with (
             ui.tabs(value=start)  # a value that comes later would count as a change of the part
             .props("no-caps align=left active-color=tab indicator-color=tab dense")

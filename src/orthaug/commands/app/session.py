@@ -14,7 +14,7 @@ import shutil
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -23,6 +23,7 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
+from orthaug.commands.app.kept_results import KeptResult, keep_result, kept_results
 from orthaug.commands.app.processes import Command, WorkerPool
 from orthaug.commands.app.spec_text import (
     Shelf,
@@ -30,8 +31,10 @@ from orthaug.commands.app.spec_text import (
     files,
     in_file,
     keep,
+    kept_name,
     kept_title,
     plain,
+    results_folder,
     section,
     with_physics,
     with_value,
@@ -66,8 +69,8 @@ class Session:
         """Why the chosen channels make no spec."""
         self.spec = ""
         self.kept_as = ""
-        """The title under which its spec is kept when the server ends; empty until there is
-        something to keep.
+        """The name under which its spec and its results are kept when the server ends; empty
+        until there is something to keep.
         """
         self.undone: list[str] = []
         """Specs that redo brings back, the next one last."""
@@ -90,6 +93,14 @@ class Session:
         self.results: dict[str, dict[str, Any]] = {}
         self.verdicts: dict[str, dict[str, Any]] = {}
         """Of each result: `level` and `sentences`, as its report begins."""
+        self.kept: list[KeptResult] = []
+        """Results of this spec, the oldest first."""
+        self.shown: dict[str, int] = {}
+        """By kind, the number of the kept result that is shown."""
+        self.curves: dict[str, dict[str, Any]] = {}
+        """Of each result, and of a pair, what the worker's `free_runs` gives."""
+        self.pair: tuple[KeptResult, ...] = ()
+        """Two fits that are compared."""
         self.exports: dict[str, str] = {}
         """By target, why there is none; empty where there is."""
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -299,8 +310,14 @@ class Session:
             else absolute(in_file(path), path.absolute().parent)
         )
         self.title = kept_title(path) if kept else path.name
+        self.kept_as = path.stem if kept else ""
         self.write(text, "file")
         self.mark_changed("data")
+        if kept:
+            self.kept = kept_results(self._results_folder)
+            for kind in KINDS:
+                if own := [result for result in self.kept if result.kind == kind]:
+                    self.show_result(own[-1])
 
     # Spec
 
@@ -335,9 +352,12 @@ class Session:
         self.authors.append(author)
         self.mark_changed("spec")
         if author != "file" and text.strip():
-            self.kept_as = self.kept_as or _as_name(self.title) or "spec"
-            keep(self.kept_as, self.key, text)
+            self._keep_spec()
         self._check_soon()
+
+    def _keep_spec(self) -> None:
+        self.kept_as = self.kept_as or kept_name(_as_name(self.title) or "spec", self.key)
+        keep(self.kept_as, self.spec)
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
         """Replace the spec by the result of a function of `spec_text` with these arguments."""
@@ -393,11 +413,8 @@ class Session:
 
     def reword(self, text: Any) -> str:
         """Return a message without the session's own folder and file names."""
-        text = (
-            str(text)
-            .removeprefix(f"{self.folder / 'check.toml'}: ")
-            .removeprefix(f"{self.folder / 'spec.toml'}: ")
-        )
+        own = re.escape(f"{self.folder}{os.sep}")
+        text = re.sub(rf"^{own}[\w-]+\.toml: ", "", str(text))
         return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
 
     # Training
@@ -426,17 +443,68 @@ class Session:
     async def _follow_run(self, kind: str, command: Command, spec: str) -> None:
         await command.run()
         if command.code == 0:
-            self.trained[kind] = spec
-            await self._read_result(kind)
+            self._keep_spec()
+            try:
+                keep_result(self._results_folder, kind, self.folder / kind, spec)
+            except OSError:  # it is shown all the same
+                self.trouble = "The result could not be kept beside the others."
+            self.kept = kept_results(self._results_folder)
+            self.shown[kind] = self.kept[-1].number if self.kept else 0
+            await self._read_result(kind, spec)
         self.mark_changed("work")
 
-    async def _read_result(self, kind: str) -> None:
-        """Read the result in the folder, and the verdict that its report begins with."""
+    @property
+    def _results_folder(self) -> Path:
+        return results_folder(self.kept_as)
+
+    async def _read_result(self, kind: str, spec: str) -> None:
+        """Read the result in the folder, the verdict of its report, and its free runs."""
         place = self.folder / kind / "result.json"
+        self.trained[kind] = spec
         self.verdicts.pop(kind, None)
+        self.curves.pop(kind, None)
+        self.exports.clear()
         with suppress(OSError, ValueError):  # InputError among them
             self.results[kind] = json.loads(place.read_text(encoding="utf-8"))
             self.verdicts[kind] = await self.desk.ask("verdict", path=place, kind=kind)
+        self.mark_changed("work")
+        models = {folder.name: folder for folder in sorted((place.parent / "models").glob("*"))}
+        fitted = {"model": place.parent / "model", "physics alone": place.parent / "model-physics"}
+        await self._run_freely(kind, spec, models or fitted)
+
+    async def _run_freely(self, what: str, spec: str, models: Mapping[str, Path]) -> None:
+        """Ask for the free runs of saved models on the data of a spec."""
+        place = self.folder / f"{what}-runs.toml"
+        place.write_text(spec, encoding="utf-8")
+        there = {name: folder for name, folder in models.items() if folder.is_dir()}
+        try:
+            self.curves[what] = await self.desk.ask("free_runs", path=place, models=there)
+        except InputError as error:
+            self.curves[what] = {"refused": self.reword(error)}
+        self.mark_changed("work")
+
+    def show_result(self, kept: KeptResult, *, with_spec: bool = False) -> None:
+        """Show a kept result again; `with_spec` makes its spec the present one."""
+        if self.running is not None:
+            return
+        place = self.folder / kept.kind
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(kept.folder, place)
+        (place / "spec.toml").unlink(missing_ok=True)  # it is no part of what the command writes
+        self.shown[kept.kind] = kept.number
+        if with_spec:
+            self.write(kept.spec, "kept")
+        self.start(self._read_result(kept.kind, kept.spec))
+
+    def choose_pair(self, kept: KeptResult, chosen: bool) -> None:
+        """Take a fit into the pair that is compared, or out of it; of three the first one goes."""
+        others = tuple(one for one in self.pair if one.number != kept.number)
+        self.pair = (*others, kept)[-2:] if chosen else others
+        self.curves.pop("pair", None)
+        self.mark_changed("work")
+        if len(self.pair) == 2:
+            models = {one.name: one.folder / "model" for one in self.pair}
+            self.start(self._run_freely("pair", self.pair[-1].spec, models))
 
     def stop(self) -> None:
         """Interrupt the training that runs now."""

@@ -6,6 +6,7 @@ And the files where specs are kept.
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -56,19 +57,30 @@ def in_file(path: Path) -> str:
     return text
 
 
-def keep(title: str, key: str, spec: str) -> None:
-    """Write the spec of a session anew, whole or not at all.
+def keep(name: str, spec: str) -> None:
+    """Write the spec of a session anew, whole or not at all; the oldest ones and their results go.
 
     It does nothing where the folder cannot be written.
     """
-    place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
+    place = results_folder(name).with_name(f"{name}.toml")
     with suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
         partial = place.with_suffix(".partial")
         partial.write_text(spec, encoding="utf-8")
         os.replace(partial, place)
         for old in earlier()[_KEPT:]:
+            shutil.rmtree(results_folder(old.stem), ignore_errors=True)
             old.unlink(missing_ok=True)
+
+
+def kept_name(title: str, key: str) -> str:
+    """Return the name under which a session keeps its spec and its results."""
+    return f"{title}-{key[: _MARK - 1]}"
+
+
+def results_folder(name: str) -> Path:
+    """Return the folder of the results of a spec that is kept under a name."""
+    return _folder() / name
 
 
 def earlier() -> list[Path]:

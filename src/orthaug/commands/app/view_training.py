@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from html import escape
 from typing import Any
 
 from nicegui import ui
 
+from orthaug.commands.app.kept_results import KeptResult
 from orthaug.commands.app.processes import Command, Run
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.spec_text import names, section
 from orthaug.commands.app.widgets import (
     button,
     card,
+    curves_figure,
+    interval_figure,
+    label_widget,
     loss_figure,
     note,
     number,
@@ -21,12 +27,14 @@ from orthaug.commands.app.widgets import (
     plot,
     redrawn,
     run_name,
+    sentence,
     table,
     text,
 )
 
 _MOST = 1500  # points of a curve of the loss
 _LEAST = 8  # points that are worth a curve
+_KEPT_HINT = "They are kept when the server ends. Open shows one again, with its spec."
 _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
@@ -92,8 +100,10 @@ class TrainingView:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
         self._draw_losses([] if shown is None else shown.losses)
-        trained = [session.trained.get(kind) for kind in _TITLES]
-        state = (running is None, *trained, session.spec, session.units, *session.verdicts.values())
+        state = (
+            *(running is None, session.spec, session.units, dict(session.shown)),
+            *(list(session.verdicts), list(session.curves), session.pair, session.kept),
+        )
         if state != self._state:
             self._state = state
             self._draw_results()
@@ -158,7 +168,88 @@ class TrainingView:
                         verdict := session.verdicts.get(kind)
                     ) is not None:  # that the report begins with
                         note(" ".join(verdict["sentences"]), verdict["level"])
+                    _runs(session.curves.get(kind))
                     draw(result, session.units if same else {})
+            if session.kept:
+                with card("Results of this spec", _KEPT_HINT):
+                    self._list_results()
+
+    def _list_results(self) -> None:
+        session = self.session
+        shown = {(kind, number) for kind, number in session.shown.items()}
+        fits = sum(kept.kind == "fit" for kept in session.kept)
+        for kept in reversed(session.kept):
+            with label_widget(
+                ui.element("div").classes("entry").props("role=group"), kept.name
+            ):
+                with ui.element("div").classes("grow"):
+                    what = "" if kept.kind == "fit" else " (comparison)"
+                    text(f"{kept.number}. {kept.score}{what}", "p", "strong")
+                    text(f"{kept.made:%Y-%m-%d %H:%M} · {kept.change}", "p", "hint")
+                if kept.kind == "fit" and fits > 1:
+                    self._offer_pair(kept)
+                made = button("Open", partial(session.show_result, kept, with_spec=True))
+                label_widget(made, f"Open {kept.name}")
+                same = (kept.kind, kept.number) in shown and kept.spec == session.spec
+                made.set_enabled(session.running is None and not same)
+        if len(session.pair) == 2:
+            _pair(session.pair, session.curves.get("pair"))
+
+    def _offer_pair(self, kept: KeptResult) -> None:
+        chosen = any(one.number == kept.number for one in self.session.pair)
+        made = ui.checkbox("compare", value=chosen)
+        made.on_value_change(lambda event: self.session.choose_pair(kept, bool(event.value)))
+        label_widget(made, f"compare {kept.name}")
+
+
+def _runs(found: Mapping[str, Any] | None) -> None:
+    """Draw measured outputs and free runs."""
+    if found is None:
+        note("Simulating the free runs …", "busy")
+        return
+    if "refused" in found:
+        note(f"The free runs are not drawn: {found['refused']}", "care")
+        return
+    rows = []
+    for row in found["rows"]:
+        names = [curve["name"] for curve in row["curves"]]
+        curves = [
+            {**curve, "raw": i == 0, "entry": i}
+            for i, curve in enumerate(row["curves"])
+        ]
+        rows.append((f"{row['label']}, {row['part']}", curves))
+    if rows:
+        plot(curves_figure(rows), f"Free runs of {', '.join(names[1:])}, and what was measured.")
+        text(
+            f"What was measured, and the free run of {_listed(names[1:])}: of each part the "
+            f"{len(curves[0]['x'])} rows where {names[1]} errs most. Drag to zoom.",
+            "p",
+            "hint",
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(", ".join(names).rsplit(", ", 1))
+
+
+def _pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
+    """Draw two results beside each other."""
+    read = [json.loads((one.folder / "result.json").read_text(encoding="utf-8")) for one in pair]
+    models = [(one.name, result["parameters"]) for one, result in zip(pair, read, strict=True)]
+    text(f"{sentence(pair[0].name)} and {pair[1].name}", "h3")
+    _interval_plot(models, {})
+    _runs(curves)
+    _scores([(one.name, result["scores"]) for one, result in zip(pair, read, strict=True)], "")
+    _parameters("Parameters", models, {})
+
+
+def _interval_plot(
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+) -> None:
+    units = {row["name"]: row["unit"] for _, rows in models for row in rows if row["unit"]} | units
+    if any(rows for _, rows in models):
+        names = ", ".join(name for name, _ in models)
+        plot(interval_figure(models, units), f"Parameters with 95 % intervals of {names}.")
 
 
 def _runs_caption(runs: set[Run]) -> str:
@@ -244,6 +335,7 @@ def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
     if result["chosen"]:
         text(f"Chosen on the validation part: {result['chosen']}.", "p", "strong")
     models = result["comparison"]
+    _interval_plot([(row["name"], row["parameters"]) for row in models], units)
     _scores([(row["name"], row["scores"]) for row in models], _output_units(result))
     _parameters("Parameters", [(row["name"], row["parameters"]) for row in models], units)
     weights = [f"{row['name']} {row['weights']}" for row in models]

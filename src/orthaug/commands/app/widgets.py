@@ -170,9 +170,11 @@ def curves_figure(
 ) -> dict[str, Any]:
     """Return a figure of curves below one another on a common time axis.
 
-    Each row has a label, and traces with `x`, `y`, `name` and `raw`.
+    Each row has a label, and traces with `x`, `y`, `name` and `raw`; where they have an `entry`,
+    each name has one in the legend, and the color of that number.
     """
     traces: list[dict[str, Any]] = []
+    named = set[str]()
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {
         "title": _compact_layout(unit),
@@ -190,8 +192,10 @@ def curves_figure(
             **{"title": _compact_layout(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
-            raw = curve.get("raw", False)
-            line = {"width": 1.2, "color": "#8b949e" if raw else _COLORS[i % len(_COLORS)]}
+            raw, entry = curve.get("raw", False), curve.get("entry")
+            color = _COLORS[(i if entry is None else entry) % len(_COLORS)]
+            line = {"width": 2.4 if raw and entry is not None else 1.2}
+            line["color"] = "#8b949e" if raw else color
             own = {
                 "name": curve["name"],
                 "x": curve["x"],
@@ -206,7 +210,55 @@ def curves_figure(
                     "mode": "lines",
                     "xaxis": "x",
                     "yaxis": axis,
-                    "showlegend": False,
+                    "legendgroup": curve["name"],
+                    "showlegend": entry is not None and curve["name"] not in named,
+                }
+            )
+            named.add(curve["name"])
+    if any(trace["showlegend"] for trace in traces):
+        layout["margin"]["t"] += _ENTRY + 8
+        layout["legend"] = {"orientation": "h", "yref": "container", "y": 1, "yanchor": "top", "x": 0}
+    return {"data": traces, "layout": layout, "config": _CONFIG}
+
+
+def interval_figure(
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return a figure of each parameter in every model, with its 95 % interval."""
+    names = list(dict.fromkeys(row["name"] for _, rows in models for row in rows))
+    height = 34 + 20 * len(models)
+    layout, traces = _layout(30 + (height + 26) * len(names)), list[dict[str, Any]]()
+    layout |= {"hovermode": "closest", "grid": {"rows": len(names), "columns": 1, "ygap": 0.75}}
+    layout |= {"showlegend": False}
+    for i, name in enumerate(names):
+        axis = str(i + 1) if i else ""
+        unit = units.get(name, "")
+        layout[f"xaxis{axis}"] = {"zeroline": False, "nticks": 6, "automargin": True}
+        layout[f"xaxis{axis}"]["title"] = {
+            **_compact_layout(f"{name} [{unit}]" if unit not in ("", "1") else name),
+            "standoff": 2,
+        }
+        layout[f"yaxis{axis}"] = {
+            **{"type": "category", "automargin": True, "autorange": "reversed"},
+            **{"range": [-0.6, len(models) - 0.4], "categoryarray": [own for own, _ in models]},
+        }
+        for j, (model, rows) in enumerate(models):
+            row = next((row for row in rows if row["name"] == name), None)
+            if row is None or row["value"] is None:
+                continue
+            low, high = row["ci95"] or (None, None)
+            bar = [0.0 if end is None else abs(end - row["value"]) for end in (high, low)]
+            color = _COLORS[j % len(_COLORS)]
+            traces.append(
+                {
+                    **{"type": "scatter", "mode": "markers", "name": escape(model)},
+                    **{"x": [row["value"]], "y": [escape(model)]},
+                    **{"xaxis": f"x{axis}", "yaxis": f"y{axis}"},
+                    "marker": {"size": 8, "color": color},
+                    "error_x": {
+                        **{"type": "data", "symmetric": False, "color": color, "thickness": 2},
+                        **{"array": bar[:1], "arrayminus": bar[1:]},
+                    },
                 }
             )
     return {"data": traces, "layout": layout, "config": _CONFIG}

@@ -11,9 +11,9 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,9 +27,13 @@ from orthaug.data.columns import Column
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Survey
 
+if TYPE_CHECKING:
+    from orthaug.models.response import Response
+
 MOST = 3000
 """Points of a curve that are drawn."""
 _KEPT = 600e6  # bytes that a process may have held to go on
+_PARTS, _STRETCH = 4, 500  # parts of the data, and rows of each, whose free runs are drawn
 _DRAWN = 12  # columns of a file whose curves are
 
 
@@ -228,6 +232,50 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
     return {"level": found.level, "sentences": found.sentences}
 
 
+def free_runs(path: str, models: dict[str, str]) -> dict[str, Any]:
+    """Return measured outputs and the free runs of saved models, by part and output of a spec.
+
+    Of each part it is the stretch on which the first model errs most.
+    """
+    from orthaug.models.storage import load
+
+    job, loaded = open_job(Path(path), require_full_rank=False), []
+    for name, folder in models.items():
+        loaded.append((name, load(Path(folder))))
+    rows = []
+    for part in job.parts[:_PARTS]:
+        ran = {name: model.simulate(part.record) for name, model in loaded}
+        rows += _stretch(part.name, ran)
+    return {"rows": rows}
+
+
+def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, Any]]:
+    """Return for each output the curves of the worst stretch of one experiment."""
+    from orthaug.reports.page_runs import worst_window
+
+    first = next(iter(ran.values()))
+    errors = [np.square(np.nan_to_num(t.errors)).sum() for t in first.trajectories]
+    worst = int(np.argmax(np.nan_to_num(errors)))
+    measured, model = first.trajectories[worst].measured, first.trajectories[worst].model
+    assert measured is not None
+    begin = worst_window(measured, model, _STRETCH) if len(model) > _STRETCH else 0
+    own = slice(begin, begin + _STRETCH)
+    time = first.trajectories[worst].time(first.sampling_time)[own]
+    known = {"measured": measured}
+    known |= {name: response.trajectories[worst].model for name, response in ran.items()}
+    return [
+        {
+            "label": f"{channel.name} [{channel.unit}]" if channel.unit else channel.name,
+            "part": part,
+            "curves": [
+                {"name": name, "x": _plain(time), "y": _plain(values[own, j])}
+                for name, values in known.items()
+            ],
+        }
+        for j, channel in enumerate(first.outputs)
+    ]
+
+
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
     """Return for each parameter its name, the unit in the spec and the one its regressor implies.
 
@@ -290,6 +338,7 @@ QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "look": look,
     "examine": examine,
     "example": example,
+    "free_runs": free_runs,
     "verdict": verdict,
 }
 
