@@ -9,10 +9,43 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
+
+
+class Stage(StrEnum):
+    """Stages of a fit after its runs, in their order; a fit may omit some."""
+
+    CHOICE = "choosing between the runs"
+    SCORES = "scores"
+    INTERVALS = "intervals and residual tests"
+    VERDICT = "verdict on the learner"
+    DOUBTS = "unmodelled effects"
+    ADVICE = "trials of advice"
+    FIGURES = "figures"
+    REPORT = "report"
+
+    def enter(self) -> None:
+        """Log that a fit has come to this stage."""
+        _STAGE_LOG.info("%s", self.value)
+
+
+_STAGE_LOG = LOG.getChild("stage")
+
+
+def follow_stages(show: Callable[[str], None]) -> None:
+    """Call `show` with every stage that a fit of this process comes to."""
+
+    class Follower(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            show(record.getMessage())
+
+    _STAGE_LOG.handlers[:] = [Follower()]
+    _STAGE_LOG.setLevel(logging.INFO)
+
 
 ProgressCallback = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop

@@ -14,7 +14,14 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Plan, Progress, ProgressCallback, StopTraining
+from orthaug._base.progress import (
+    SILENT,
+    Plan,
+    Progress,
+    ProgressCallback,
+    StopTraining,
+    follow_stages,
+)
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -120,6 +127,8 @@ class _Lines:
         self.runs, self.iterations = runs, iterations
         self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
+        if self._wanted:
+            follow_stages(lambda stage: streams.say(json.dumps({"stage": stage})))
 
     def planned(self, first: int, plan: Plan) -> None:
         """Set the runs that follow from this number on."""

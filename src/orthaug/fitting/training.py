@@ -15,7 +15,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import LOG, ProgressCallback
+from orthaug._base.progress import LOG, ProgressCallback, Stage
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import (
@@ -149,6 +149,7 @@ def train(
     )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
+    Stage.CHOICE.enter()
     held_out = _held_out(task, starts, runs, concluded, structure, solver, choice, runner)
     errors = (
         [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]

@@ -569,6 +569,10 @@ class Session:
             if task is self._check or task is self._look:
                 task.cancel()
         await asyncio.gather(*(command.end() for command in self.commands.values()))
+        rest = list(self._tasks)
+        for task in rest:
+            task.cancel()
+        await asyncio.gather(*rest, return_exceptions=True)
 
 
 class Sessions:

@@ -423,7 +423,9 @@ def _proposal(found: Mapping[str, Any]) -> str:
     elif any(column["kind"] for column in found["columns"]):
         why = "Proposed by the names of the columns"
     else:
-        return "The names of the columns do not show which are inputs and outputs: choose them here."
+        return (
+            "The names of the columns do not show which are inputs and outputs: choose them here."
+        )
     return f"{why}. Confirm it with the button below, or choose otherwise."
 
 

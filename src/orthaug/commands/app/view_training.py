@@ -10,6 +10,7 @@ from typing import Any
 
 from nicegui import ui
 
+from orthaug._base.progress import Stage
 from orthaug.commands.app.kept_results import KeptResult
 from orthaug.commands.app.processes import Command, Run
 from orthaug.commands.app.session import Session
@@ -137,10 +138,17 @@ class TrainingView:
                     f"{progress['iteration']}"
                 )
                 now += f", loss {number(progress['loss'], 4)}"
+            done = progress.get("done", 0)
+            if command.stage is not None:
+                step, steps = list(Stage).index(command.stage) + 1, len(Stage)
+                now, done = (
+                    f"after the runs, {step} of {steps}: {command.stage.value}",
+                    step / steps,
+                )
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
             note(f"{what}: {now} · {took}", "busy")
-            self.bar.props(f"value={progress.get('done', 0)}")
+            self.bar.props(f"value={done}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {took}; nothing was kept of it.", "care")
         elif command.code == 0 and command.ending:
@@ -179,9 +187,7 @@ class TrainingView:
         shown = {(kind, number) for kind, number in session.shown.items()}
         fits = sum(kept.kind == "fit" for kept in session.kept)
         for kept in reversed(session.kept):
-            with label_widget(
-                ui.element("div").classes("entry").props("role=group"), kept.name
-            ):
+            with label_widget(ui.element("div").classes("entry").props("role=group"), kept.name):
                 with ui.element("div").classes("grow"):
                     what = "" if kept.kind == "fit" else " (comparison)"
                     text(f"{kept.number}. {kept.score}{what}", "p", "strong")
@@ -210,22 +216,29 @@ def _runs(found: Mapping[str, Any] | None) -> None:
     if "refused" in found:
         note(f"The free runs are not drawn: {found['refused']}", "care")
         return
-    rows = []
-    for row in found["rows"]:
-        names = [curve["name"] for curve in row["curves"]]
-        curves = [
-            {**curve, "raw": i == 0, "entry": i}
-            for i, curve in enumerate(row["curves"])
-        ]
-        rows.append((f"{row['label']}, {row['part']}", curves))
-    if rows:
-        plot(curves_figure(rows), f"Free runs of {', '.join(names[1:])}, and what was measured.")
+    for part in dict.fromkeys(row["part"] for row in found["rows"]):
+        rows = []
+        for row in (row for row in found["rows"] if row["part"] == part):
+            measured, *models = row["curves"]
+            first = {**measured, "raw": True, "entry": 0}
+            runs = [{**model, "entry": i} for i, model in enumerate(models)]
+            rows.append((row["label"], [first, *reversed(runs)]))
+            rows.append(("error", [_less(measured, run) for run in reversed(runs)]))
+        names = _listed([model["name"] for model in models])
+        text(f"Free run on {part}", "h3")
+        plot(curves_figure(rows), f"Free run of {names} on {part}, measured, and the error.")
         text(
-            f"What was measured, and the free run of {_listed(names[1:])}: of each part the "
-            f"{len(curves[0]['x'])} rows where {names[1]} errs most. Drag to zoom.",
+            f"The {len(measured['x'])} rows where {models[0]['name']} errs most; the error is what "
+            "was measured less the free run. Drag to zoom.",
             "p",
             "hint",
         )
+
+
+def _less(measured: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the curve of measured less model."""
+    pairs = zip(measured["y"], run["y"], strict=True)
+    return {**run, "y": [None if a is None or b is None else a - b for a, b in pairs]}
 
 
 def _listed(names: Sequence[str]) -> str:

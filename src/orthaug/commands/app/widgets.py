@@ -123,8 +123,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
             lines.append(
-                f"<td class='{kind}' data-label='{escape(name, True)}'>"
-                f"{marked(value)}</td>"
+                f"<td class='{kind}' data-label='{escape(name, True)}'>{marked(value)}</td>"
             )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
@@ -217,7 +216,13 @@ def curves_figure(
             named.add(curve["name"])
     if any(trace["showlegend"] for trace in traces):
         layout["margin"]["t"] += _ENTRY + 8
-        layout["legend"] = {"orientation": "h", "yref": "container", "y": 1, "yanchor": "top", "x": 0}
+        layout["legend"] = {
+            "orientation": "h",
+            "yref": "container",
+            "y": 1,
+            "yanchor": "top",
+            "x": 0,
+        }
     return {"data": traces, "layout": layout, "config": _CONFIG}
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MOST = 3000
 """Points of a curve that are drawn."""
 _KEPT = 600e6  # bytes that a process may have held to go on
-_PARTS, _STRETCH = 4, 500  # parts of the data, and rows of each, whose free runs are drawn
+_PARTS, _STRETCH = 4, 300  # parts of the data, and rows of each, whose free runs are drawn
 _DRAWN = 12  # columns of a file whose curves are
 
 
@@ -169,7 +169,9 @@ def _curves(found: Survey) -> dict[str, Any]:
         counted = time is None or len(time) < len(values) or not np.isfinite(time).all()
         if counted:
             time = step * np.arange(len(values))
-        curves[column.header] = thin_curve(time, values) | {"untimed": counted and not found.clock.step}
+        curves[column.header] = thin_curve(time, values) | {
+            "untimed": counted and not found.clock.step
+        }
     return curves
 
 
