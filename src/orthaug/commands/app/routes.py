@@ -70,12 +70,13 @@ class Page:
                 self.redo.props("aria-keyshortcuts=Control+Shift+Z")
         start = "Training" if self.session.commands or self.session.shown else "Data"
         with (
-            ui.tabs(value=start)  # a value that comes later would count as a change of the part
+            ui.tabs()
             .props("no-caps align=left active-color=tab indicator-color=tab dense")
             .classes("tabs") as tabs
         ):
             for name in _PARTS:
                 ui.tab(name)
+        tabs.set_value(start)  # before anyone follows: a later one would count as a change
         self._keep_history(tabs, start)
         parts = (self.data, self.model, self.training, self.report, self.export)
         with ui.tab_panels(tabs, value=start).props("animated=false").classes("parts"):
@@ -142,7 +143,7 @@ class Page:
             or has_moved("data")
             or self.session.running is not None
         ):
-            looks.append(self.training.follow_work)
+            looks += [self.training.follow_work, self.model.follow_work]
         elif has_moved("check"):
             looks.append(self.training.follow_check)
         if has_moved("work") or has_moved("spec"):

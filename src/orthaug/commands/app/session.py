@@ -45,6 +45,7 @@ _SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
 _TYPING = 2.0  # s between two changes in the editor that are undone together
 KINDS = ("fit", "compare")
+_RUNS = (*KINDS, "starts")
 
 
 class Session:
@@ -423,26 +424,34 @@ class Session:
     def running(self) -> Command | None:
         """The training that runs now."""
         return next(
-            (command for kind in KINDS if (command := self.commands.get(kind)) and command.running),
+            (command for kind in _RUNS if (command := self.commands.get(kind)) and command.running),
             None,
         )
 
     def train(self, kind: str) -> None:
-        """Run `orthaug fit` or `orthaug compare` on the spec."""
+        """Run `orthaug fit` or `orthaug compare` on the spec.
+
+        `starts` is a fit of its physics alone, whose parameters become the initial ones.
+        """
         if self.running is not None or not self.spec.strip():
             return
-        place = self.folder / "spec.toml"
-        place.write_text(self.spec, encoding="utf-8")
+        place, spec, verb = self.folder / "spec.toml", self.spec, kind
+        if kind == "starts":
+            place, verb = self.folder / "starts.toml", "fit"
+            spec = with_value(spec, ("learner",), {"kind": "none"})
+        place.write_text(spec, encoding="utf-8")
         shutil.rmtree(self.folder / f"{kind}.training", ignore_errors=True)
         self.exports.clear()
-        arguments = (kind, str(place), "--out", str(self.folder / kind), "--force")
+        arguments = (verb, str(place), "--out", str(self.folder / kind), "--force")
         command = self.commands[kind] = Command(arguments, lambda: self.mark_changed("work"))
         self.mark_changed("work")
         self.start(self._follow_run(kind, command, self.spec))
 
     async def _follow_run(self, kind: str, command: Command, spec: str) -> None:
         await command.run()
-        if command.code == 0:
+        if command.code == 0 and kind == "starts":
+            self._take_starts()
+        elif command.code == 0:
             self._keep_spec()
             try:
                 keep_result(self._results_folder, kind, self.folder / kind, spec)
@@ -452,6 +461,18 @@ class Session:
             self.shown[kind] = self.kept[-1].number if self.kept else 0
             await self._read_result(kind, spec)
         self.mark_changed("work")
+
+    def _take_starts(self) -> None:
+        """Write the parameters of physics alone into the spec as initial values."""
+        spec = self.spec
+        with suppress(OSError, ValueError):
+            found = json.loads((self.folder / "starts" / "result.json").read_text("utf-8"))
+            known = section(self.content(), "motion", "parameters")
+            for row in found["parameters"]:
+                if row["value"] is not None and row["name"] in known:
+                    path = ("motion", "parameters", row["name"], "initial")
+                    spec = with_value(spec, path, float(f"{row['value']:.6g}"))
+            self.write(spec, "starts")
 
     @property
     def _results_folder(self) -> Path:

@@ -6,6 +6,7 @@ And the files where specs are kept.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
 # Keys whose values are text, digits or not
-_WORDS = ("parameter", "regressor", "output", "unit", "channel")
+_WORDS = ("parameter", "regressor", "output", "unit", "channel", "derivative", "next")
 _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 
@@ -237,6 +238,40 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
             table[path[-1]].update(value)
         else:
             table[path[-1]] = value
+
+    return edit_text(text, change)
+
+
+def with_name(text: str, path: Sequence[str], new: str) -> str:
+    """Return the text with another name for a state or a parameter of a motion, in its expressions.
+
+    Raises:
+        InputError: a name that is taken, or is none.
+    """
+    *above, old = path
+    known = section(plain(text), *above)
+    if new == old:
+        return text
+    if not re.fullmatch(r"[A-Za-z]\w*", new, re.ASCII) or new in known:
+        raise InputError(f"'{new}' is taken, or no name: letters, digits and underscores.")
+
+    def renamed(value: Any) -> Any:
+        own = rf"\b{re.escape(old)}\b"
+        return re.sub(own, new, value) if isinstance(value, str) else value
+
+    def change(document: Any) -> None:
+        table = _table_at(document, above)
+        for name, row in [(name, table.pop(name)) for name in list(table)]:
+            table[new if name == old else name] = row
+        motion = document["motion"]
+        for row in motion.get("states", {}).values():
+            row |= {key: renamed(row[key]) for key in ("derivative", "next") if key in row}
+        for part in ("outputs", "define"):
+            for name, value in section(motion, part).items():
+                motion[part][name] = renamed(value)
+        seen = section(document, "learner").get("inputs")
+        if isinstance(seen, list):
+            document["learner"]["inputs"] = [renamed(value) for value in seen]
 
     return edit_text(text, change)
 

@@ -36,7 +36,7 @@ from orthaug.commands.app.widgets import (
 _MOST = 1500  # points of a curve of the loss
 _LEAST = 8  # points that are worth a curve
 _KEPT_HINT = "They are kept when the server ends. Open shows one again, with its spec."
-_TITLES = {"fit": "Training", "compare": "Comparison"}
+_TITLES = {"fit": "Training", "compare": "Comparison", "starts": "Start values"}
 
 
 class TrainingView:
@@ -126,7 +126,8 @@ class TrainingView:
         self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
-        progress, what = command.progress, _TITLES.get(command.arguments[0], "")
+        kinds = {id(own): kind for kind, own in self.session.commands.items()}
+        progress, what = command.progress, _TITLES[kinds[id(command)]]
         took = f"{command.seconds:.0f} s"
         if command.running:
             now = "reading and compiling"
@@ -257,9 +258,10 @@ def _pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
 
 
 def _interval_plot(
-    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], given: Mapping[str, str]
 ) -> None:
-    units = {row["name"]: row["unit"] for _, rows in models for row in rows if row["unit"]} | units
+    units = {row["name"]: row["unit"] for _, rows in models for row in rows if row["unit"]}
+    units |= given
     if any(rows for _, rows in models):
         names = ", ".join(name for name, _ in models)
         plot(interval_figure(models, units), f"Parameters with 95 % intervals of {names}.")

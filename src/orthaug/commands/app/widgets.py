@@ -161,6 +161,7 @@ def note(what: str, kind: str = "") -> ui.html:
 
 _MOST_ENTRIES = 8  # of a legend
 _ENTRY = 19  # px of one
+_AXIS = 58  # px of an axis with its title
 _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
@@ -193,8 +194,10 @@ def curves_figure(
         for curve in drawn:
             raw, entry = curve.get("raw", False), curve.get("entry")
             color = _COLORS[(i if entry is None else entry) % len(_COLORS)]
-            line = {"width": 2.4 if raw and entry is not None else 1.2}
-            line["color"] = "#8b949e" if raw else color
+            line = {
+                "width": 2.4 if raw and entry is not None else 1.2,
+                "color": "#8b949e" if raw else color,
+            }
             own = {
                 "name": curve["name"],
                 "x": curve["x"],
@@ -231,21 +234,23 @@ def interval_figure(
 ) -> dict[str, Any]:
     """Return a figure of each parameter in every model, with its 95 % interval."""
     names = list(dict.fromkeys(row["name"] for _, rows in models for row in rows))
-    height = 34 + 20 * len(models)
-    layout, traces = _layout(30 + (height + 26) * len(names)), list[dict[str, Any]]()
-    layout |= {"hovermode": "closest", "grid": {"rows": len(names), "columns": 1, "ygap": 0.75}}
-    layout |= {"showlegend": False}
+    one = 22 * len(models) + 8  # px of the dots of a parameter, with its axis below
+    whole = (one + _AXIS) * len(names)
+    layout, traces = _layout(whole + 16), list[dict[str, Any]]()
+    layout |= {"hovermode": "closest", "showlegend": False}
+    layout["margin"] |= {"t": 8, "b": 8}
     for i, name in enumerate(names):
-        axis = str(i + 1) if i else ""
-        unit = units.get(name, "")
-        layout[f"xaxis{axis}"] = {"zeroline": False, "nticks": 6, "automargin": True}
-        layout[f"xaxis{axis}"]["title"] = {
-            **_compact_layout(f"{name} [{unit}]" if unit not in ("", "1") else name),
-            "standoff": 2,
+        axis, top = (str(i + 1) if i else ""), 1 - i * (one + _AXIS) / whole
+        title = f"{name} [{units[name]}]" if units.get(name, "1") != "1" else name
+        layout[f"xaxis{axis}"] = {
+            **{"zeroline": False, "nticks": 5, "anchor": f"y{axis}"},
+            "title": _compact_layout(escape(title)) | {"standoff": 4},
         }
         layout[f"yaxis{axis}"] = {
-            **{"type": "category", "automargin": True, "autorange": "reversed"},
-            **{"range": [-0.6, len(models) - 0.4], "categoryarray": [own for own, _ in models]},
+            **{"type": "category", "automargin": True, "anchor": f"x{axis}"},
+            **{"domain": [max(0.0, top - one / whole), top]},
+            **{"range": [len(models) - 0.4, -0.6]},
+            **{"categoryorder": "array", "categoryarray": [escape(own) for own, _ in models]},
         }
         for j, (model, rows) in enumerate(models):
             row = next((row for row in rows if row["name"] == name), None)

@@ -166,12 +166,12 @@ def _curves(found: Survey) -> dict[str, Any]:
     for column in found.signals[:_DRAWN]:
         values = column.values[: column.filled]
         time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
-        counted = time is None or len(time) < len(values) or not np.isfinite(time).all()
-        if counted:
+        untimed = time is None or len(time) < len(values) or not np.isfinite(time).all()
+        if untimed:
             time = step * np.arange(len(values))
-        curves[column.header] = thin_curve(time, values) | {
-            "untimed": counted and not found.clock.step
-        }
+        assert time is not None
+        untimed = untimed and found.clock.step is None
+        curves[column.header] = {**thin_curve(time, values), "untimed": untimed}
     return curves
 
 
