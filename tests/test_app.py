@@ -7,6 +7,7 @@ import errno
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -964,6 +965,155 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
     other.check("Data", "Model", "Training", "Report", "Export")
     other.close()
     tab.close()
+
+
+@browsed
+def test_example_data_lead_on_and_every_change_is_taken_back(server, browser):
+    tab = Tab(browser, server)
+    page = tab.page
+    assert page.get_by_role("button", name="Continue to Model").is_disabled()
+    assert "Start with a data file" in page.inner_text(".onward:visible")
+    page.get_by_role("button", name="Try it with a mass, spring and damper").click()
+    page.wait_for_selector("text=tests.uniform")
+    page.get_by_role("button", name="Continue to Model").click()
+    page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Model')")
+    page.wait_for_selector(".note.good:has-text('can be trained')")
+    editor = page.get_by_label("spec in TOML")
+    terms = tomllib.loads(editor.input_value())
+
+    # both kinds of physics are kept
+    page.get_by_label("written as").select_option("motion")
+    page.wait_for_selector("[aria-label='parameter k']")
+    page.get_by_label("initial").first.fill("7")
+    page.get_by_label("initial").first.press("Enter")
+    heavy = "() => document.querySelector('.editor textarea').value.includes('initial = 7')"
+    page.wait_for_function(heavy)
+    page.get_by_label("written as").select_option("terms")
+    page.wait_for_selector("[aria-label='term 3']")
+    assert tomllib.loads(editor.input_value()) == terms
+    page.get_by_label("written as").select_option("motion")
+    page.wait_for_function(heavy)
+
+    # undo and redo, by button and by key
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_selector("[aria-label='term 3']")
+    page.keyboard.press("Control+z")
+    page.wait_for_function(heavy)
+    page.keyboard.press("Control+Shift+z")
+    page.wait_for_selector("[aria-label='term 3']")
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_function(heavy)
+
+    # a reload keeps the part, the place, and what was typed
+    page.get_by_label("unit").first.fill("stone")
+    page.evaluate("scrollTo(0, 400)")
+    page.wait_for_timeout(600)
+    page.reload()
+    page.wait_for_function("[...document.querySelectorAll('input')].some(i => i.value === 'stone')")
+    page.wait_for_function("Math.abs(scrollY - 400) < 3")
+    assert page.evaluate("location.hash") == "#Model"
+    assert "stone" not in page.get_by_label("spec in TOML").input_value()
+    tab.go("Data")
+    page.wait_for_function("scrollY === 0")
+    tab.check("Model")
+    tab.close()
+
+
+@browsed
+def test_a_motion_is_edited_in_its_form_and_checked_as_it_is_written(server, browser):
+    tab = Tab(browser, server)
+    page = tab.page
+    page.get_by_role("button", name="Try it with").click()
+    page.wait_for_selector("text=tests.uniform")
+    tab.go("Model")
+    page.get_by_label("written as").select_option("motion")
+
+    def enter(label: str, value: str, group: str) -> None:
+        made = page.locator(f"[aria-label='{group}']").get_by_label(label, exact=True)
+        made.fill(value)
+        made.press("Enter")
+
+    def motion() -> dict[str, Any]:
+        return tomllib.loads(tab.fetch("spec.toml").decode())["motion"]
+
+    enter("dv/dt", "(force - c*v - k*q)/m", "state v")
+    page.wait_for_selector("[aria-label='state v'] .wrong:has-text(\"unknown name 'q'\")")
+    assert page.locator("[aria-label='state x'] .wrong").count() == 0
+    enter("dv/dt", "(force - c*v - k*x)/m", "state v")
+    page.wait_for_selector(".wrong", state="detached")
+    enter("name", "mass", "parameter m")
+    page.wait_for_selector("[aria-label='parameter mass']")
+    assert motion()["states"]["v"]["derivative"] == "(force - c*v - k*x)/mass"
+    page.get_by_role("button", name="Add a state").click()
+    enter("name", "lag", "state s1")
+    enter("dlag/dt", "v - lag", "state lag")
+    page.locator("[aria-label='state lag']").get_by_label("learner added").click()
+    page.get_by_role("button", name="Add a parameter").click()
+    enter("max", "3", "parameter p1")
+    page.wait_for_function(
+        "() => document.querySelector('.editor textarea').value.includes('max = 3')"
+    )
+    found = motion()
+    assert found["states"]["lag"] == {"derivative": "v - lag", "learned": True}
+    assert found["parameters"]["p1"] == {"initial": 1.0, "max": 3}
+    assert list(found["parameters"]) == ["mass", "c", "k", "p1"]
+    page.get_by_label("Remove parameter p1").click()
+    page.wait_for_selector("[aria-label='parameter p1']", state="detached")
+    tab.close()
+
+
+@browsed
+def test_results_stand_side_by_side_and_outlive_the_server(serve, browser, csv, tmp_path):
+    server = serve(tmp_path)
+    tab = Tab(browser, server)
+    page = tab.page
+    tab.page.get_by_label("or its path").fill(str(csv))
+    tab.page.get_by_label("or its path").press("Enter")
+    page.wait_for_selector("text=first physics")
+
+    def train(neurons: int, number: int) -> None:
+        tab.go("Model")
+        tab.write(
+            lambda text: re.sub(r"hidden = \[\d+\]", f"hidden = [{neurons}]", text).replace(
+                "restarts = 3", "restarts = 1\niterations = 20"
+            )
+        )
+        tab.go("Training")
+        page.get_by_role("button", name="Train", exact=True).click()
+        page.wait_for_selector("text=after the runs")  # its stages are named
+        page.wait_for_selector(f"[aria-label='result {number}']")
+        page.wait_for_selector("text=Free run on train")
+
+    train(3, 1)
+    train(2, 2)
+    assert "hidden: [3] → [2]" in page.inner_text("[aria-label='result 2']")
+    assert "NRMSE" in page.inner_text("[aria-label='result 1']")
+    for number in (1, 2):
+        page.get_by_label(f"compare result {number}").click()
+    page.wait_for_selector("text=rows where result 1 errs most")
+    page.wait_for_selector("[aria-label='Parameters with 95 % intervals of result 1, result 2.']")
+    tab.check("Training")
+    second = tab.fetch("result.json")
+    page.get_by_label("Open result 1").click()
+    page.wait_for_function("document.querySelector('.editor') || true")
+    page.wait_for_selector("[aria-label='result 1'] button[disabled]")
+    assert b"hidden = [3]" in tab.fetch("spec.toml") and tab.fetch("result.json") != second
+    tab.leave()
+    server.process.kill()
+    server.process.communicate()
+
+    server = serve(tmp_path)
+    tab = Tab(browser, server)
+    tab.page.get_by_role("button", name="plant.csv, 20").click()
+    tab.go("Training")
+    tab.page.wait_for_selector("[aria-label='result 2']")
+    tab.page.wait_for_selector("text=Free run on train")
+    assert tab.fetch("result.json") == second
+    tab.go("Report")
+    heading = tab.page.frame_locator("iframe").locator("h1")
+    assert heading.inner_text() == "Model of y from u"
+    tab.close()
+    server.end()
 
 
 class Keys:

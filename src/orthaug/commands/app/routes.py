@@ -143,9 +143,11 @@ class Page:
             or has_moved("data")
             or self.session.running is not None
         ):
-            looks += [self.training.follow_work, self.model.follow_work]
+            looks.append(self.training.follow_work)
         elif has_moved("check"):
             looks.append(self.training.follow_check)
+        if has_moved("work") or self.session.starting is not None:
+            looks.append(self.model.follow_work)
         if has_moved("work") or has_moved("spec"):
             looks += [self.report.follow_work, self.export.follow_work]
         if now != seen:

@@ -45,7 +45,6 @@ _SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
 _TYPING = 2.0  # s between two changes in the editor that are undone together
 KINDS = ("fit", "compare")
-_RUNS = (*KINDS, "starts")
 
 
 class Session:
@@ -80,6 +79,10 @@ class Session:
         self.shelf: Shelf = {}
         """By kind of physics, what the spec had of it before another kind took its place."""
         self._typed = 0.0
+        self.starting: float | None = None
+        """When the estimation of initial values began that runs now."""
+        self.start_trouble = ""
+        """Why there are no new initial values."""
         self.authors: list[str] = []
         """Author of each change of the spec: a part of a page, which ignores its own changes."""
         self.checked: dict[str, Any] | None = None
@@ -368,6 +371,29 @@ class Session:
         """Write the physics as `terms` or as equations of `motion`; the other kind is kept."""
         self.edit("physics", with_physics, kind, self.shelf)
 
+    def estimate_starts(self) -> None:
+        """Estimate initial values of a motion from the data, and write them into the spec."""
+        self.starting, self.start_trouble = time.monotonic(), ""
+        self.mark_changed("work")
+        self.start(self._estimate_starts(self.spec))
+
+    async def _estimate_starts(self, begun: str) -> None:
+        place = self.folder / "starts.toml"
+        place.write_text(begun, encoding="utf-8")
+        try:
+            spec, found = begun, await self.desk.ask("starts", path=place)
+            for name, value in found["values"].items():
+                spec = with_value(spec, ("motion", "parameters", name, "initial"), value)
+            if self.spec == begun:
+                self.write(spec, "starts")
+            else:
+                self.start_trouble = "the spec has changed meanwhile; estimate them again."
+        except InputError as error:
+            self.start_trouble = self.reword(error)
+        finally:
+            self.starting = None
+            self.mark_changed("work")
+
     def _check_soon(self) -> None:
         if self._check is not None:
             self._check.cancel()
@@ -424,34 +450,26 @@ class Session:
     def running(self) -> Command | None:
         """The training that runs now."""
         return next(
-            (command for kind in _RUNS if (command := self.commands.get(kind)) and command.running),
+            (command for kind in KINDS if (command := self.commands.get(kind)) and command.running),
             None,
         )
 
     def train(self, kind: str) -> None:
-        """Run `orthaug fit` or `orthaug compare` on the spec.
-
-        `starts` is a fit of its physics alone, whose parameters become the initial ones.
-        """
+        """Run `orthaug fit` or `orthaug compare` on the spec."""
         if self.running is not None or not self.spec.strip():
             return
-        place, spec, verb = self.folder / "spec.toml", self.spec, kind
-        if kind == "starts":
-            place, verb = self.folder / "starts.toml", "fit"
-            spec = with_value(spec, ("learner",), {"kind": "none"})
-        place.write_text(spec, encoding="utf-8")
+        place = self.folder / "spec.toml"
+        place.write_text(self.spec, encoding="utf-8")
         shutil.rmtree(self.folder / f"{kind}.training", ignore_errors=True)
         self.exports.clear()
-        arguments = (verb, str(place), "--out", str(self.folder / kind), "--force")
+        arguments = (kind, str(place), "--out", str(self.folder / kind), "--force")
         command = self.commands[kind] = Command(arguments, lambda: self.mark_changed("work"))
         self.mark_changed("work")
         self.start(self._follow_run(kind, command, self.spec))
 
     async def _follow_run(self, kind: str, command: Command, spec: str) -> None:
         await command.run()
-        if command.code == 0 and kind == "starts":
-            self._take_starts()
-        elif command.code == 0:
+        if command.code == 0:
             self._keep_spec()
             try:
                 keep_result(self._results_folder, kind, self.folder / kind, spec)
@@ -461,18 +479,6 @@ class Session:
             self.shown[kind] = self.kept[-1].number if self.kept else 0
             await self._read_result(kind, spec)
         self.mark_changed("work")
-
-    def _take_starts(self) -> None:
-        """Write the parameters of physics alone into the spec as initial values."""
-        spec = self.spec
-        with suppress(OSError, ValueError):
-            found = json.loads((self.folder / "starts" / "result.json").read_text("utf-8"))
-            known = section(self.content(), "motion", "parameters")
-            for row in found["parameters"]:
-                if row["value"] is not None and row["name"] in known:
-                    path = ("motion", "parameters", row["name"], "initial")
-                    spec = with_value(spec, path, float(f"{row['value']:.6g}"))
-            self.write(spec, "starts")
 
     @property
     def _results_folder(self) -> Path:

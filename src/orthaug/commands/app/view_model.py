@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -164,7 +165,7 @@ class ModelView:
         self._wrong["outputs"] = ui.element("div")
         text("Start values", "h3")
         with ui.element("div").classes("fields"):
-            self.starts = button("Estimate from the data", lambda: self.session.train("starts"))
+            self.starts = button("Estimate from the data", self.session.estimate_starts)
             self.starting = ui.element("div").classes("grow")
         self.follow_work()
 
@@ -185,8 +186,10 @@ class ModelView:
                 )
                 for key in keys:
                     label = f"d{name}/dt" if key == "derivative" else key
-                    wide = "regressor" if key in ("derivative", "next") else "short"
-                    field(label, row.get(key), self._value(*path, key), classes=wide)
+                    wide = {"derivative": "regressor", "next": "regressor", "start": "medium"}
+                    field(
+                        label, row.get(key), self._value(*path, key), classes=wide.get(key, "short")
+                    )
                 if kind == "state":
                     made = ui.checkbox("learner added", value=bool(row.get("learned")))
                     made.on_value_change(partial(self._set_learned, path))
@@ -207,19 +210,19 @@ class ModelView:
 
     def follow_work(self) -> None:
         """Show how the estimation of start values goes."""
-        command = self.session.commands.get("starts")
-        if "motion" not in self.session.content() or self.starting.is_deleted:
+        session = self.session
+        if "motion" not in session.content() or self.starting.is_deleted:
             return
-        self.starts.set_enabled(self.session.running is None)
+        self.starts.set_enabled(session.starting is None)
         with redrawn(self.starting):
-            if command is None:
-                text("Fits the physics alone; its values become the initial ones.", "p", "hint")
-            elif command.running:
-                note(f"Fitting the physics alone · {command.seconds:.0f} s", "busy")
-            elif command.code == 0:
-                note("The initial values are those of the physics alone; Undo takes them back.")
-            elif not command.stopping:
-                note(self.session.reword(command.complaint), "bad")
+            if session.starting is not None:
+                took = time.monotonic() - session.starting
+                note(f"Fitting the physics alone to short segments · {took:.0f} s", "busy")
+            elif session.start_trouble:
+                note(sentence(session.start_trouble), "bad")
+            else:
+                hint = "The physics alone is fitted to segments that lengthen; Undo takes it back."
+                text(hint, "p", "hint")
 
     def _show_wrong(self) -> None:
         """Show under a state, parameter or output what the check refuses about it."""

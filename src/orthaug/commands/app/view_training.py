@@ -36,7 +36,7 @@ from orthaug.commands.app.widgets import (
 _MOST = 1500  # points of a curve of the loss
 _LEAST = 8  # points that are worth a curve
 _KEPT_HINT = "They are kept when the server ends. Open shows one again, with its spec."
-_TITLES = {"fit": "Training", "compare": "Comparison", "starts": "Start values"}
+_TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
 class TrainingView:
@@ -126,8 +126,7 @@ class TrainingView:
         self._told = len(losses)
 
     def _tell(self, command: Command) -> None:
-        kinds = {id(own): kind for kind, own in self.session.commands.items()}
-        progress, what = command.progress, _TITLES[kinds[id(command)]]
+        progress, what = command.progress, _TITLES.get(command.arguments[0], "")
         took = f"{command.seconds:.0f} s"
         if command.running:
             now = "reading and compiling"

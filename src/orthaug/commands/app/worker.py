@@ -12,6 +12,7 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,8 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.commands import init as starting
-from orthaug.commands.job import Job
+from orthaug.commands.app.spec_text import with_value
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.job_result import check as check_job
 from orthaug.commands.opening import open_job
 from orthaug.data.columns import Column
@@ -34,6 +36,7 @@ MOST = 3000
 """Points of a curve that are drawn."""
 _KEPT = 600e6  # bytes that a process may have held to go on
 _PARTS, _STRETCH = 4, 300  # parts of the data, and rows of each, whose free runs are drawn
+_SEGMENTS, _START_ROWS, _START_ITERATIONS = (10, 80), 600, 40  # of start values
 _DRAWN = 12  # columns of a file whose curves are
 
 
@@ -234,6 +237,35 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
     return {"level": found.level, "sentences": found.sentences}
 
 
+def starts(path: str) -> dict[str, Any]:
+    """Return initial values for the parameters of a motion, by name.
+
+    The physics alone is fitted to the first rows in segments that lengthen: short ones find
+    parameters that are far from where they begin.
+    """
+    from orthaug._base.jax import use_compilation_cache
+    from orthaug.fitting.criteria import Simulation
+
+    use_compilation_cache()
+    place = Path(path)
+    spec = with_value(place.read_text("utf-8"), ("training", "iterations"), _START_ITERATIONS)
+    values: dict[str, float] = {}
+    for segment in _SEGMENTS:
+        place.write_text(spec, encoding="utf-8")
+        job = open_job(place, require_full_rank=False)
+        longest = max(job.train.record.experiments, key=len)
+        record = replace(job.train.record, experiments=(longest,)).rows(0, _START_ROWS)
+        fit = replace(job, problem=job.problem.on(record)).run(
+            Variant(PHYSICS_ONLY, criterion=Simulation(min(segment, len(record) - 1), 0))
+        )
+        for name, value in zip(fit.problem.names, fit.values, strict=True):
+            if np.isfinite(value):
+                values[name] = float(f"{value:.6g}")
+                path_of = ("motion", "parameters", name, "initial")
+                spec = with_value(spec, path_of, values[name])
+    return {"values": values}
+
+
 def free_runs(path: str, models: dict[str, str]) -> dict[str, Any]:
     """Return measured outputs and the free runs of saved models, by part and output of a spec.
 
@@ -341,6 +373,7 @@ QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "examine": examine,
     "example": example,
     "free_runs": free_runs,
+    "starts": starts,
     "verdict": verdict,
 }
 
