@@ -50,7 +50,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the bac
 import runpy
 runpy.run_module("orthaug", run_name="__main__")
 """
-LATE = 90_000  # ms
+LATE = 40_000  # ms
 SPEC = """# kept
 [data]
 inputs = ["u"]

@@ -525,6 +525,8 @@ class Session:
 
     def choose_pair(self, kept: KeptResult, chosen: bool) -> None:
         """Take a fit into the pair that is compared, or out of it; of three the first one goes."""
+        if chosen == (kept in self.pair):
+            return
         others = tuple(one for one in self.pair if one.number != kept.number)
         self.pair = (*others, kept)[-2:] if chosen else others
         self.curves.pop("pair", None)

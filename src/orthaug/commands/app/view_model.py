@@ -193,6 +193,7 @@ class ModelView:
                 if kind == "state":
                     made = ui.checkbox("learner added", value=bool(row.get("learned")))
                     made.on_value_change(partial(self._set_learned, path))
+                    label_widget(made, "learner added")
                 self._wrong[name] = ui.element("div").classes("grow")
             remove = partial(self.session.edit, "more terms", spec_text.with_value, path, None)
             label_widget(button("Remove", remove), f"Remove {kind} {name}")

@@ -47,6 +47,9 @@ class TrainingView:
         self._told = 0  # losses that are drawn
         self._curve: ui.plotly | None = None
         self._state: Any = None
+        self._listed: Any = None
+        self._pair: Any = None
+        self._boxes: dict[int, ui.checkbox] = {}
 
     def draw(self) -> None:
         with card(
@@ -64,6 +67,9 @@ class TrainingView:
             )
             self.losses = ui.element("div")
         self.results = ui.element("div")
+        with card("Results of this spec", _KEPT_HINT) as self.history:
+            self.kept = ui.element("div")
+            self.compared = ui.element("div")
         self.follow_work()
 
     def follow_check(self) -> None:
@@ -101,13 +107,32 @@ class TrainingView:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
         self._draw_losses([] if shown is None else shown.losses)
-        state = (
-            *(running is None, session.spec, session.units, dict(session.shown)),
-            *(list(session.verdicts), list(session.curves), session.pair, session.kept),
-        )
+        state = (running is None, session.spec, session.units, dict(session.shown))
+        state += (list(session.verdicts), [session.curves.get(kind) for kind in _TITLES])
         if state != self._state:
             self._state = state
             self._draw_results()
+        self.history.set_visibility(bool(session.kept))
+        listed = (running is None, session.kept, dict(session.shown), session.spec)
+        if listed != self._listed:
+            self._listed = listed
+            self._list_results()
+        self._follow_pair()
+
+    def _follow_pair(self) -> None:
+        """Show the two results that are compared."""
+        session, pair = self.session, self.session.pair
+        for number, box in self._boxes.items():
+            box.set_value(any(one.number == number for one in pair))
+        state = (pair, session.curves.get("pair"))
+        if state == self._pair:
+            return
+        self._pair = state
+        with redrawn(self.compared):
+            if len(pair) == 2:
+                _draw_pair(pair, session.curves.get("pair"))
+            elif pair:
+                text(f"Choose another one to compare with {pair[0].name}.", "p", "hint")
 
     def _draw_losses(self, losses: Sequence[tuple[Run, int, float | None]]) -> None:
         losses = losses if len(losses) >= _LEAST else []
@@ -178,34 +203,31 @@ class TrainingView:
                         note(" ".join(verdict["sentences"]), verdict["level"])
                     _runs(session.curves.get(kind))
                     draw(result, session.units if same else {})
-            if session.kept:
-                with card("Results of this spec", _KEPT_HINT):
-                    self._list_results()
 
     def _list_results(self) -> None:
-        session = self.session
-        shown = {(kind, number) for kind, number in session.shown.items()}
+        session, shown = self.session, set(self.session.shown.items())
         fits = sum(kept.kind == "fit" for kept in session.kept)
-        for kept in reversed(session.kept):
-            with label_widget(ui.element("div").classes("entry").props("role=group"), kept.name):
-                with ui.element("div").classes("grow"):
-                    what = "" if kept.kind == "fit" else " (comparison)"
-                    text(f"{kept.number}. {kept.score}{what}", "p", "strong")
-                    text(f"{kept.made:%Y-%m-%d %H:%M} · {kept.change}", "p", "hint")
-                if kept.kind == "fit" and fits > 1:
-                    self._offer_pair(kept)
-                made = button("Open", partial(session.show_result, kept, with_spec=True))
-                label_widget(made, f"Open {kept.name}")
-                same = (kept.kind, kept.number) in shown and kept.spec == session.spec
-                made.set_enabled(session.running is None and not same)
-        if len(session.pair) == 2:
-            _pair(session.pair, session.curves.get("pair"))
+        self._boxes.clear()
+        with redrawn(self.kept):
+            for kept in reversed(session.kept):
+                with label_widget(
+                    ui.element("div").classes("entry").props("role=group"), kept.name
+                ):
+                    with ui.element("div").classes("grow"):
+                        what = "" if kept.kind == "fit" else " (comparison)"
+                        text(f"{kept.number}. {kept.score}{what}", "p", "strong")
+                        text(f"{kept.made:%Y-%m-%d %H:%M} · {kept.change}", "p", "hint")
+                    if kept.kind == "fit" and fits > 1:
+                        box = self._boxes[kept.number] = ui.checkbox("compare")
+                        box.on_value_change(partial(self._choose, kept))
+                        label_widget(box, f"compare {kept.name}")
+                    made = button("Open", partial(session.show_result, kept, with_spec=True))
+                    label_widget(made, f"Open {kept.name}")
+                    same = (kept.kind, kept.number) in shown and kept.spec == session.spec
+                    made.set_enabled(session.running is None and not same)
 
-    def _offer_pair(self, kept: KeptResult) -> None:
-        chosen = any(one.number == kept.number for one in self.session.pair)
-        made = ui.checkbox("compare", value=chosen)
-        made.on_value_change(lambda event: self.session.choose_pair(kept, bool(event.value)))
-        label_widget(made, f"compare {kept.name}")
+    def _choose(self, kept: KeptResult, event: Any) -> None:
+        self.session.choose_pair(kept, bool(event.value))
 
 
 def _runs(found: Mapping[str, Any] | None) -> None:
@@ -245,15 +267,19 @@ def _listed(names: Sequence[str]) -> str:
     return " and ".join(", ".join(names).rsplit(", ", 1))
 
 
-def _pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
+def _draw_pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
     """Draw two results beside each other."""
     read = [json.loads((one.folder / "result.json").read_text(encoding="utf-8")) for one in pair]
     models = [(one.name, result["parameters"]) for one, result in zip(pair, read, strict=True)]
     text(f"{sentence(pair[0].name)} and {pair[1].name}", "h3")
     _interval_plot(models, {})
     _runs(curves)
-    _scores([(one.name, result["scores"]) for one, result in zip(pair, read, strict=True)], "")
-    _parameters("Parameters", models, {})
+    _scores(
+        [(one.name, result["scores"]) for one, result in zip(pair, read, strict=True)],
+        "",
+        "Scores of both",
+    )
+    _parameters("Parameters of both", models, {})
 
 
 def _interval_plot(
@@ -325,7 +351,9 @@ def _output_units(result: Mapping[str, Any]) -> str:
     return f" [{', '.join(units)}]" if set(units) - {"–"} else ""
 
 
-def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
+def _scores(
+    models: Sequence[tuple[str, Mapping[str, Any]]], unit: str, caption: str = "Scores"
+) -> None:
     rows = []
     for name, scores in models:
         for part, kinds in scores.items():
@@ -338,7 +366,7 @@ def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
             ]
             rows.append((name or part, *([part] if name else []), *own))
     head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
-    table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, "Scores")
+    table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, caption)
 
 
 def _numbers(values: Sequence[float | None] | None, digits: int = 4) -> str:
@@ -350,8 +378,11 @@ def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
         text(f"Chosen on the validation part: {result['chosen']}.", "p", "strong")
     models = result["comparison"]
     _interval_plot([(row["name"], row["parameters"]) for row in models], units)
-    _scores([(row["name"], row["scores"]) for row in models], _output_units(result))
-    _parameters("Parameters", [(row["name"], row["parameters"]) for row in models], units)
+    scores = [(row["name"], row["scores"]) for row in models]
+    _scores(scores, _output_units(result), "Scores of every model")
+    _parameters(
+        "Parameters of every model", [(row["name"], row["parameters"]) for row in models], units
+    )
     weights = [f"{row['name']} {row['weights']}" for row in models]
     text(f"Weights of the learner: {', '.join(weights)}.", "p", "hint")
     for row in models:
