@@ -128,7 +128,7 @@ def spec_text(
         linear = "linear difference equations, to be replaced by what you know"
         document.add(tomlkit.comment(f"The physics: {linear} ([motion]: equations of motion)."))
         document.add("baseline", _baseline(named, model))
-        sees = "the lags that the physics reads; [lags] gives it more, `inputs` fewer"
+        sees = "the lags that the physics reads; [lags] gives it more, learner.inputs fewer"
     else:
         document.add(tomlkit.comment("The physics: equations of motion, for you to change."))
         document.add("motion", motion_section(motion))
