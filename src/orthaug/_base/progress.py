@@ -33,18 +33,37 @@ class Stage(StrEnum):
         _STAGE_LOG.info("%s", self.value)
 
 
-_STAGE_LOG = LOG.getChild("stage")
+_STAGE_LOG, _MODEL_LOG = LOG.getChild("stage"), LOG.getChild("model")
+_MODEL_LOG.propagate = False  # its records are no text
 
 
-def follow_stages(show: Callable[[str], None]) -> None:
-    """Call `show` with every stage that a fit of this process comes to."""
+def show_model(name: str, fit: Callable[[], Any], record: Any) -> None:
+    """Hand a fit that training has reached to who follows this process.
 
-    class Follower(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            show(record.getMessage())
+    Args:
+        fit: makes it, or None; it is called only where somebody follows.
+        record: the training data.
+    """
+    if not _MODEL_LOG.handlers:
+        return
+    try:
+        _MODEL_LOG.info("%s", name, extra={"fit": fit(), "record": record})
+    except Exception:  # it is shown only: training goes on
+        LOG.debug("a model of training cannot be shown", exc_info=True)
 
-    _STAGE_LOG.handlers[:] = [Follower()]
-    _STAGE_LOG.setLevel(logging.INFO)
+
+def follow_training(
+    show_stage: Callable[[str], None], show_fit: Callable[[str, Any, Any], None]
+) -> None:
+    """Call functions with every stage, and every model with its record, of fits of this process."""
+    for log, show in (
+        (_STAGE_LOG, lambda record: show_stage(record.getMessage())),
+        (_MODEL_LOG, lambda record: show_fit(record.getMessage(), record.fit, record.record)),
+    ):
+        handler = logging.Handler()
+        handler.emit = show  # pyright: ignore[reportAttributeAccessIssue]
+        log.handlers[:] = [handler]
+        log.setLevel(logging.INFO)
 
 
 ProgressCallback = Callable[[int, int, float], None]

@@ -49,6 +49,8 @@ class Command:
     """(run, iteration, loss) of each line of progress."""
     stage: Stage | None = None
     """The stage after the runs that it has come to."""
+    models: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By name, the free run of physics alone and of the best run so far: `time`, `outputs`."""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
     ended: float | None = None
@@ -116,6 +118,10 @@ class Command:
                 self.lines = [*self.lines, line][-_LINES:]
             elif "stage" in told:
                 self._enter(Stage(told["stage"]))
+            elif "model" in told:
+                if self.stage is None:  # else it is of a trial
+                    self.models.pop(told["model"], None)
+                    self.models[told["model"]] = told
             else:
                 self.progress, self.stage = told, None
                 self.losses.append((Run.of(told), told["iteration"], told["loss"]))
@@ -151,9 +157,9 @@ class Command:
 
 
 def _told(line: str) -> dict[str, Any] | None:
-    """Return what a line tells of the training, a run or a stage; None for any other line."""
+    """Return what a line tells of the training: a run, a stage or a model; None for others."""
     with suppress(ValueError):
-        return json.loads(line) if line.startswith(('{"run"', '{"stage"')) else None
+        return json.loads(line) if line.startswith(('{"run"', '{"stage"', '{"model"')) else None
     return None
 
 

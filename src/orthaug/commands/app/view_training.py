@@ -47,6 +47,7 @@ class TrainingView:
         self._told = 0  # losses that are drawn
         self._curve: ui.plotly | None = None
         self._state: Any = None
+        self._models: list[int] = []
         self._listed: Any = None
         self._pair: Any = None
         self._boxes: dict[int, ui.checkbox] = {}
@@ -65,7 +66,9 @@ class TrainingView:
             self.bar = ui.element("progress").props(
                 'max=1 value=0 aria-label="progress of training"'
             )
-            self.losses = ui.element("div")
+            with ui.element("div").classes("columns"):
+                self.losses = ui.element("div")
+                self.so_far = ui.element("div")
         self.results = ui.element("div")
         with card("Results of this spec", _KEPT_HINT) as self.history:
             self.kept = ui.element("div")
@@ -107,6 +110,7 @@ class TrainingView:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
         self._draw_losses([] if shown is None else shown.losses)
+        self._draw_so_far({} if running is None else running.models)
         state = (running is None, session.spec, session.units, dict(session.shown))
         state += (list(session.verdicts), [session.curves.get(kind) for kind in _TITLES])
         if state != self._state:
@@ -122,8 +126,9 @@ class TrainingView:
     def _follow_pair(self) -> None:
         """Show the two results that are compared."""
         session, pair = self.session, self.session.pair
-        for number, box in self._boxes.items():
-            box.set_value(any(one.number == number for one in pair))
+        chosen = {one.number for one in pair}
+        for own, box in self._boxes.items():
+            box.set_value(own in chosen)
         state = (pair, session.curves.get("pair"))
         if state == self._pair:
             return
@@ -149,6 +154,27 @@ class TrainingView:
         if losses:
             self.caption.set_content(escape(_runs_caption({run for run, _, _ in losses})))
         self._told = len(losses)
+
+    def _draw_so_far(self, models: Mapping[str, Mapping[str, Any]]) -> None:
+        """Draw what was measured, and the free run of physics alone and of the best run so far."""
+        state = [id(model) for model in models.values()]
+        if state == self._models:
+            return
+        self._models = state
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for i, (name, model) in enumerate(models.items(), 1):
+            for output, own in model["outputs"].items():
+                label = f"{output} [{own['unit']}]" if own["unit"] else output
+                first = {"name": "measured", "y": own["measured"], "raw": True, "entry": 0}
+                row = rows.setdefault(label, [{**first, "x": model["time"]}])
+                row.append({"name": name, "x": model["time"], "y": own["model"], "entry": i})
+        with redrawn(self.so_far):
+            if rows:
+                label = "Free run on the training data, so far."
+                plot(curves_figure(list(rows.items())), label)
+                text(
+                    f"{label[:-1]}: its first rows, with the best run that has ended.", "p", "hint"
+                )
 
     def _tell(self, command: Command) -> None:
         progress, what = command.progress, _TITLES.get(command.arguments[0], "")
