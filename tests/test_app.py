@@ -25,8 +25,11 @@ import pytest
 from test_cli import run, signals, write_csv
 
 from orthaug import InputError, load_spec
-from orthaug.commands.app import spec_text
+from orthaug._base.progress import Stage
+from orthaug.commands import demo
+from orthaug.commands.app import spec_text, worker
 from orthaug.commands.app.gate import Gate
+from orthaug.commands.app.kept_results import keep_result, kept_results
 from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thin_curve
@@ -50,7 +53,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a process in the bac
 import runpy
 runpy.run_module("orthaug", run_name="__main__")
 """
-LATE = 40_000  # ms
+LATE = 90_000  # ms
 SPEC = """# kept
 [data]
 inputs = ["u"]
@@ -377,6 +380,67 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
     ]
     told = [Run.of(line) for line in lines]
     assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
+
+
+def test_lines_of_progress_name_the_stages_after_the_runs(monkeypatch, capsys):
+    monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
+    with training_bar(1, 10):
+        Stage.SCORES.enter()
+    Stage.REPORT.enter()  # the result is written after the bar has ended
+    lines = capsys.readouterr().err.splitlines()
+    stages = [json.loads(line)["stage"] for line in lines if line.startswith("{")]
+    assert stages == ["scores", "report"]
+    command = Command(["fit"], lambda: None)
+    for stage in (Stage.SCORES, Stage.ADVICE, Stage.SCORES):  # the last one is of a trial
+        command._enter(stage)
+    assert command.stage is Stage.ADVICE
+
+
+def test_a_proposal_is_no_spec_yet(tmp_path):
+    draw = np.random.default_rng(4)
+    names = ("valve", "level")
+    write_csv(tmp_path / "noise.csv", **{name: draw.normal(size=60) for name in names})
+    found = worker.look(str(tmp_path / "noise.csv"), str(tmp_path / "s.toml"), None, None, None)
+    assert [column["kind"] for column in found["columns"]] == ["input", "output"]
+    assert found["guess"] == "" and found["spec"] is None
+    u, y = signals(400, 3)
+    write_csv(tmp_path / "rig.csv", left=u, right=y)
+    found = worker.look(str(tmp_path / "rig.csv"), str(tmp_path / "s.toml"), None, None, None)
+    assert (found["inputs"], found["outputs"], found["spec"]) == (["left"], ["right"], None)
+    assert found["guess"].startswith("past values of 'left' help to predict 'right'")
+
+
+@pytest.mark.proof
+def test_start_values_come_from_short_segments_of_the_data(tmp_path):
+    worker.example(str(tmp_path))
+    spec = (tmp_path / "spec.toml", spec_text.with_physics(demo.SPEC, "motion", {}))
+    spec[0].write_text(spec[1])
+    found = worker.starts(str(spec[0]))["values"]
+    assert 15_000 < found["k"] < 19_000 and 50 < found["c"] < 110  # from 1
+
+
+def test_the_last_results_of_a_spec_are_kept_with_what_had_changed(tmp_path):
+    made, place = tmp_path / "fit", tmp_path / "kept"
+    made.mkdir()
+    scores = {"train": {"simulation": {"nrmse": [0.5]}}, "tests.a": {"simulation": {"nrmse": None}}}
+    for i in range(12):
+        scores["tests.a"]["simulation"]["nrmse"] = [i / 100] if i < 11 else None
+        (made / "result.json").write_text(json.dumps({"scores": scores}))
+        keep_result(place, "fit", made, f"[learner]\nhidden = [{i}]\n")
+    (place / "0007-fit" / "result.json").write_text("{")  # damaged
+    kept = kept_results(place)
+    assert [one.number for one in kept] == [3, 4, 5, 6, 8, 9, 10, 11, 12]
+    assert kept[0].change == "the first one kept"
+    assert kept[-1].change == "learner.hidden: [10] → [11]"
+    assert [one.score for one in kept[-2:]] == ["NRMSE 0.1 on tests.a", "no free run"]
+    assert all((one.folder / "result.json").is_file() for one in kept)
+
+
+@served
+def test_names_in_messages_are_code_and_markup_is_text():
+    from orthaug.commands.app.widgets import marked
+
+    assert marked("set `[data] a` to <b>") == "set <code>[data] a</code> to &lt;b&gt;"
 
 
 @served
@@ -914,6 +978,9 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
 
     # a reload in the middle finds it again, and it can be stopped
     page.wait_for_selector("text=iteration")
+    page.wait_for_selector("text=Free run on the training data, so far")
+    shown = page.locator("[aria-label^='Free run on the training data'] .legendtext")
+    assert shown.all_inner_texts()[:2] == ["measured", "physics alone"]
     page.reload()
     page.wait_for_selector("text=iteration")
     assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"
@@ -1191,8 +1258,7 @@ def test_the_whole_path_by_keyboard_alone(server, browser, csv, tmp_path):
     keys.to("or its path on this machine")
     keys.write(str(tmp_path / "rig.csv"))
     page.wait_for_selector("text=use of left")
-    keys.to("use of left")
-    keys.press("ArrowDown")
+    keys.to("use of left")  # proposed as an input
     keys.to("use of right")
     page.keyboard.type("output")
     keys.to("Begin with these channels")
@@ -1350,6 +1416,9 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
     tab.go("Model")
     page.wait_for_selector("text=Choose the channels in Data first")
     tab.go("Data")
+    page.wait_for_selector("text=Proposed, since past values of 'left' help to predict 'right'")
+    uses = [page.get_by_label(f"use of {name}").input_value() for name in ("left", "right")]
+    assert uses == ["input", "output"] and page.locator(".editor textarea").count() == 0
     page.get_by_label("use of left").select_option("input")
     page.get_by_label("use of right").select_option("output")
     for wrong, told in (

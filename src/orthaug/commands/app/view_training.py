@@ -66,7 +66,7 @@ class TrainingView:
             self.bar = ui.element("progress").props(
                 'max=1 value=0 aria-label="progress of training"'
             )
-            with ui.element("div").classes("columns"):
+            with ui.element("div").classes("columns beside"):
                 self.losses = ui.element("div")
                 self.so_far = ui.element("div")
         self.results = ui.element("div")
