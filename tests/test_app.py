@@ -980,7 +980,7 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
     page.wait_for_selector("text=iteration")
     page.wait_for_selector("text=Free run on the training data, so far")
     shown = page.locator("[aria-label^='Free run on the training data'] .legendtext")
-    assert shown.all_inner_texts()[:2] == ["measured", "physics alone"]
+    assert shown.all_text_contents()[:2] == ["measured", "physics alone"]
     page.reload()
     page.wait_for_selector("text=iteration")
     assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"

@@ -250,7 +250,8 @@ class DataView:
             if found["spec"] is None and not self._of_spec(found):
                 note(found["open"] or _proposal(found), "care")
             with ui.element("div").classes("fields"):
-                step = "" if found["step"] is None else f"{found['step']:g}"
+                declared = spec_text.section(self.session.content(), "data").get("sampling_time")
+                step = spec_text.field_text(declared if found["step"] is None else found["step"])
                 label = "sampling time in s"
                 self.step_field = field(
                     label,
