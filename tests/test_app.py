@@ -7,6 +7,7 @@ import errno
 import importlib.util
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -24,8 +25,11 @@ import pytest
 from test_cli import run, signals, write_csv
 
 from orthaug import InputError, load_spec
-from orthaug.commands.app import spec_text
+from orthaug._base.progress import Stage
+from orthaug.commands import demo
+from orthaug.commands.app import spec_text, worker
 from orthaug.commands.app.gate import Gate
+from orthaug.commands.app.kept_results import keep_result, kept_results
 from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thin_curve
@@ -160,7 +164,7 @@ def test_forms_change_a_spec_and_nothing_else(tmp_path):
         "one": {"files": ["../c.csv"]},
         "new": {"files": ["d.csv"]},
     }
-    moving = tomllib.loads(spec_text.as_motion(SPEC))
+    moving = tomllib.loads(spec_text.with_physics(SPEC, "motion", {}))
     assert moving["motion"]["outputs"] == {"y": "x"} and "baseline" not in moving
     with pytest.raises(InputError, match="broken TOML"):
         spec_text.plain("[data\n")
@@ -171,7 +175,7 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     write_csv(tmp_path / "run.csv", **{"Force (N)": u, "Position (mm)": y})
     assert run("init", tmp_path / "run.csv", "--inputs", "Force (N)", "--outputs", "Position (mm)",
                "--out", tmp_path / "spec.toml").code == 0  # fmt: skip
-    moving = spec_text.as_motion((tmp_path / "spec.toml").read_text())
+    moving = spec_text.with_physics((tmp_path / "spec.toml").read_text(), "motion", {})
     motion = tomllib.loads(moving)["motion"]
     assert {name: row["unit"] for name, row in motion["parameters"].items()} == {
         **{"m": "N s²/mm", "c": "N s/mm", "k": "N/mm"}
@@ -180,9 +184,47 @@ def test_equations_of_motion_take_the_units_of_the_channels_and_leave_no_stale_c
     for stale in ("difference equations", "lags", "trains on the free run"):
         assert stale not in moving
     assert "# Every key" in moving  # what is still true stays
-    metres = spec_text.as_motion((tmp_path / "spec.toml").read_text().replace('"mm"', '"m"'))
+    written = (tmp_path / "spec.toml").read_text().replace('"mm"', '"m"')
+    metres = spec_text.with_physics(written, "motion", {})
     assert tomllib.loads(metres)["motion"]["parameters"]["m"]["unit"] == "kg"
-    assert "unit" not in spec_text.as_motion(SPEC)
+    assert "unit" not in spec_text.with_physics(SPEC, "motion", {})
+
+
+def test_the_other_kind_of_physics_is_kept_and_comes_back():
+    shelf: spec_text.Shelf = {}
+    moving = spec_text.with_physics(SPEC, "motion", shelf)
+    heavy = spec_text.with_value(moving, ("motion", "parameters", "m", "initial"), 7.0)
+    back = spec_text.with_physics(heavy, "terms", shelf)
+    assert tomllib.loads(back) == tomllib.loads(SPEC)
+    again = spec_text.with_physics(back, "motion", shelf)
+    assert tomllib.loads(again) == tomllib.loads(heavy)
+    fresh = tomllib.loads(spec_text.with_physics(moving, "terms", {}))  # a spec of motions alone
+    regressors = [term["regressor"] for term in fresh["baseline"]["terms"]]
+    assert regressors == ["y[k-1]", "u[k-1]"] and "motion" not in fresh
+
+
+def test_every_change_of_the_spec_is_undone_and_redone(started):
+    async def worked() -> None:
+        session = started()
+        for text in ("a = 1", "a = 2"):
+            session.write(text, "form")
+        session.write("a = 23", "editor")
+        session.write("a = 234", "editor")  # typed in one go
+        session.undo()
+        assert session.spec == "a = 2"
+        session.undo()
+        session.undo()  # the first spec stays
+        assert session.spec == "a = 1" and session.earlier == []
+        session.redo()
+        session.redo()
+        assert session.spec == "a = 234"
+        session.undo()
+        session.write("a = 5", "form")
+        session.redo()
+        assert session.spec == "a = 5"
+        await session.close()
+
+    asyncio.run(worked())
 
 
 def trained_on(folder: Path, pattern: str) -> list[str]:
@@ -340,6 +382,67 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
     assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
 
 
+def test_lines_of_progress_name_the_stages_after_the_runs(monkeypatch, capsys):
+    monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
+    with training_bar(1, 10):
+        Stage.SCORES.enter()
+    Stage.REPORT.enter()  # the result is written after the bar has ended
+    lines = capsys.readouterr().err.splitlines()
+    stages = [json.loads(line)["stage"] for line in lines if line.startswith("{")]
+    assert stages == ["scores", "report"]
+    command = Command(["fit"], lambda: None)
+    for stage in (Stage.SCORES, Stage.ADVICE, Stage.SCORES):  # the last one is of a trial
+        command._enter(stage)
+    assert command.stage is Stage.ADVICE
+
+
+def test_a_proposal_is_no_spec_yet(tmp_path):
+    draw = np.random.default_rng(4)
+    names = ("valve", "level")
+    write_csv(tmp_path / "noise.csv", **{name: draw.normal(size=60) for name in names})
+    found = worker.look(str(tmp_path / "noise.csv"), str(tmp_path / "s.toml"), None, None, None)
+    assert [column["kind"] for column in found["columns"]] == ["input", "output"]
+    assert found["guess"] == "" and found["spec"] is None
+    u, y = signals(400, 3)
+    write_csv(tmp_path / "rig.csv", left=u, right=y)
+    found = worker.look(str(tmp_path / "rig.csv"), str(tmp_path / "s.toml"), None, None, None)
+    assert (found["inputs"], found["outputs"], found["spec"]) == (["left"], ["right"], None)
+    assert found["guess"].startswith("past values of 'left' help to predict 'right'")
+
+
+@pytest.mark.proof
+def test_start_values_come_from_short_segments_of_the_data(tmp_path):
+    worker.example(str(tmp_path))
+    spec = (tmp_path / "spec.toml", spec_text.with_physics(demo.SPEC, "motion", {}))
+    spec[0].write_text(spec[1])
+    found = worker.starts(str(spec[0]))["values"]
+    assert 15_000 < found["k"] < 19_000 and 50 < found["c"] < 110  # from 1
+
+
+def test_the_last_results_of_a_spec_are_kept_with_what_had_changed(tmp_path):
+    made, place = tmp_path / "fit", tmp_path / "kept"
+    made.mkdir()
+    scores = {"train": {"simulation": {"nrmse": [0.5]}}, "tests.a": {"simulation": {"nrmse": None}}}
+    for i in range(12):
+        scores["tests.a"]["simulation"]["nrmse"] = [i / 100] if i < 11 else None
+        (made / "result.json").write_text(json.dumps({"scores": scores}))
+        keep_result(place, "fit", made, f"[learner]\nhidden = [{i}]\n")
+    (place / "0007-fit" / "result.json").write_text("{")  # damaged
+    kept = kept_results(place)
+    assert [one.number for one in kept] == [3, 4, 5, 6, 8, 9, 10, 11, 12]
+    assert kept[0].change == "the first one kept"
+    assert kept[-1].change == "learner.hidden: [10] → [11]"
+    assert [one.score for one in kept[-2:]] == ["NRMSE 0.1 on tests.a", "no free run"]
+    assert all((one.folder / "result.json").is_file() for one in kept)
+
+
+@served
+def test_names_in_messages_are_code_and_markup_is_text():
+    from orthaug.commands.app.widgets import marked
+
+    assert marked("set `[data] a` to <b>") == "set <code>[data] a</code> to &lt;b&gt;"
+
+
 @served
 def test_curves_of_the_loss_are_named_by_start_or_by_structure():
     from orthaug.commands.app.view_training import _runs_caption
@@ -483,6 +586,7 @@ def looked(**given: Any) -> dict[str, Any]:
         "step": None,
         "account": "",
         "open": "",
+        "guess": "",
     }
     return plain | {"spec": None} | given
 
@@ -874,6 +978,9 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
 
     # a reload in the middle finds it again, and it can be stopped
     page.wait_for_selector("text=iteration")
+    page.wait_for_selector("text=Free run on the training data, so far")
+    shown = page.locator("[aria-label^='Free run on the training data'] .legendtext")
+    assert shown.all_text_contents()[:2] == ["measured", "physics alone"]
     page.reload()
     page.wait_for_selector("text=iteration")
     assert page.get_by_role("tab", name="Training").get_attribute("aria-selected") == "true"
@@ -925,6 +1032,155 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
     other.check("Data", "Model", "Training", "Report", "Export")
     other.close()
     tab.close()
+
+
+@browsed
+def test_example_data_lead_on_and_every_change_is_taken_back(server, browser):
+    tab = Tab(browser, server)
+    page = tab.page
+    assert page.get_by_role("button", name="Continue to Model").is_disabled()
+    assert "Start with a data file" in page.inner_text(".onward:visible")
+    page.get_by_role("button", name="Try it with a mass, spring and damper").click()
+    page.wait_for_selector("text=tests.uniform")
+    page.get_by_role("button", name="Continue to Model").click()
+    page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Model')")
+    page.wait_for_selector(".note.good:has-text('can be trained')")
+    editor = page.get_by_label("spec in TOML")
+    terms = tomllib.loads(editor.input_value())
+
+    # both kinds of physics are kept
+    page.get_by_label("written as").select_option("motion")
+    page.wait_for_selector("[aria-label='parameter k']")
+    page.get_by_label("initial").first.fill("7")
+    page.get_by_label("initial").first.press("Enter")
+    heavy = "() => document.querySelector('.editor textarea').value.includes('initial = 7')"
+    page.wait_for_function(heavy)
+    page.get_by_label("written as").select_option("terms")
+    page.wait_for_selector("[aria-label='term 3']")
+    assert tomllib.loads(editor.input_value()) == terms
+    page.get_by_label("written as").select_option("motion")
+    page.wait_for_function(heavy)
+
+    # undo and redo, by button and by key
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_selector("[aria-label='term 3']")
+    page.keyboard.press("Control+z")
+    page.wait_for_function(heavy)
+    page.keyboard.press("Control+Shift+z")
+    page.wait_for_selector("[aria-label='term 3']")
+    page.get_by_role("button", name="Undo").click()
+    page.wait_for_function(heavy)
+
+    # a reload keeps the part, the place, and what was typed
+    page.get_by_label("unit").first.fill("stone")
+    page.evaluate("scrollTo(0, 400)")
+    page.wait_for_timeout(600)
+    page.reload()
+    page.wait_for_function("[...document.querySelectorAll('input')].some(i => i.value === 'stone')")
+    page.wait_for_function("Math.abs(scrollY - 400) < 3")
+    assert page.evaluate("location.hash") == "#Model"
+    assert "stone" not in page.get_by_label("spec in TOML").input_value()
+    tab.go("Data")
+    page.wait_for_function("scrollY === 0")
+    tab.check("Model")
+    tab.close()
+
+
+@browsed
+def test_a_motion_is_edited_in_its_form_and_checked_as_it_is_written(server, browser):
+    tab = Tab(browser, server)
+    page = tab.page
+    page.get_by_role("button", name="Try it with").click()
+    page.wait_for_selector("text=tests.uniform")
+    tab.go("Model")
+    page.get_by_label("written as").select_option("motion")
+
+    def enter(label: str, value: str, group: str) -> None:
+        made = page.locator(f"[aria-label='{group}']").get_by_label(label, exact=True)
+        made.fill(value)
+        made.press("Enter")
+
+    def motion() -> dict[str, Any]:
+        return tomllib.loads(tab.fetch("spec.toml").decode())["motion"]
+
+    enter("dv/dt", "(force - c*v - k*q)/m", "state v")
+    page.wait_for_selector("[aria-label='state v'] .wrong:has-text(\"unknown name 'q'\")")
+    assert page.locator("[aria-label='state x'] .wrong").count() == 0
+    enter("dv/dt", "(force - c*v - k*x)/m", "state v")
+    page.wait_for_selector(".wrong", state="detached")
+    enter("name", "mass", "parameter m")
+    page.wait_for_selector("[aria-label='parameter mass']")
+    assert motion()["states"]["v"]["derivative"] == "(force - c*v - k*x)/mass"
+    page.get_by_role("button", name="Add a state").click()
+    enter("name", "lag", "state s1")
+    enter("dlag/dt", "v - lag", "state lag")
+    page.locator("[aria-label='state lag']").get_by_label("learner added").click()
+    page.get_by_role("button", name="Add a parameter").click()
+    enter("max", "3", "parameter p1")
+    page.wait_for_function(
+        "() => document.querySelector('.editor textarea').value.includes('max = 3')"
+    )
+    found = motion()
+    assert found["states"]["lag"] == {"derivative": "v - lag", "learned": True}
+    assert found["parameters"]["p1"] == {"initial": 1.0, "max": 3}
+    assert list(found["parameters"]) == ["mass", "c", "k", "p1"]
+    page.get_by_label("Remove parameter p1").click()
+    page.wait_for_selector("[aria-label='parameter p1']", state="detached")
+    tab.close()
+
+
+@browsed
+def test_results_stand_side_by_side_and_outlive_the_server(serve, browser, csv, tmp_path):
+    server = serve(tmp_path)
+    tab = Tab(browser, server)
+    page = tab.page
+    tab.page.get_by_label("or its path").fill(str(csv))
+    tab.page.get_by_label("or its path").press("Enter")
+    page.wait_for_selector("text=first physics")
+
+    def train(neurons: int, number: int) -> None:
+        tab.go("Model")
+        tab.write(
+            lambda text: re.sub(r"hidden = \[\d+\]", f"hidden = [{neurons}]", text).replace(
+                "restarts = 3", "restarts = 1\niterations = 20"
+            )
+        )
+        tab.go("Training")
+        page.get_by_role("button", name="Train", exact=True).click()
+        page.wait_for_selector("text=after the runs")  # its stages are named
+        page.wait_for_selector(f"[aria-label='result {number}']")
+        page.wait_for_selector("text=Free run on train")
+
+    train(3, 1)
+    train(2, 2)
+    assert "hidden: [3] → [2]" in page.inner_text("[aria-label='result 2']")
+    assert "NRMSE" in page.inner_text("[aria-label='result 1']")
+    for number in (1, 2):
+        page.get_by_label(f"compare result {number}").click()
+    page.wait_for_selector("text=rows where result 1 errs most")
+    page.wait_for_selector("[aria-label='Parameters with 95 % intervals of result 1, result 2.']")
+    tab.check("Training")
+    second = tab.fetch("result.json")
+    page.get_by_label("Open result 1").click()
+    page.wait_for_function("document.querySelector('.editor') || true")
+    page.wait_for_selector("[aria-label='result 1'] button[disabled]")
+    assert b"hidden = [3]" in tab.fetch("spec.toml") and tab.fetch("result.json") != second
+    tab.leave()
+    server.process.kill()
+    server.process.communicate()
+
+    server = serve(tmp_path)
+    tab = Tab(browser, server)
+    tab.page.get_by_role("button", name="plant.csv, 20").click()
+    tab.go("Training")
+    tab.page.wait_for_selector("[aria-label='result 2']")
+    tab.page.wait_for_selector("text=Free run on train")
+    assert tab.fetch("result.json") == second
+    tab.go("Report")
+    heading = tab.page.frame_locator("iframe").locator("h1")
+    assert heading.inner_text() == "Model of y from u"
+    tab.close()
+    server.end()
 
 
 class Keys:
@@ -1002,8 +1258,7 @@ def test_the_whole_path_by_keyboard_alone(server, browser, csv, tmp_path):
     keys.to("or its path on this machine")
     keys.write(str(tmp_path / "rig.csv"))
     page.wait_for_selector("text=use of left")
-    keys.to("use of left")
-    keys.press("ArrowDown")
+    keys.to("use of left")  # proposed as an input
     keys.to("use of right")
     page.keyboard.type("output")
     keys.to("Begin with these channels")
@@ -1161,6 +1416,9 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
     tab.go("Model")
     page.wait_for_selector("text=Choose the channels in Data first")
     tab.go("Data")
+    page.wait_for_selector("text=Proposed, since past values of 'left' help to predict 'right'")
+    uses = [page.get_by_label(f"use of {name}").input_value() for name in ("left", "right")]
+    assert uses == ["input", "output"] and page.locator(".editor textarea").count() == 0
     page.get_by_label("use of left").select_option("input")
     page.get_by_label("use of right").select_option("output")
     for wrong, told in (
@@ -1183,7 +1441,7 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
     # the parts stand in the history of the browser
     tab.go("Model")
     page.wait_for_function("location.hash === '#Model'")
-    page.get_by_role("button", name="Write equations").click()
+    page.get_by_label("written as").select_option("motion")
     page.wait_for_selector("text=No unit is given for m, c, k")
     page.go_back()
     page.wait_for_selector("[role=tab][aria-selected=true]:has-text('Data')")
@@ -1195,15 +1453,15 @@ def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
 def test_the_latest_specs_are_kept_whole(tmp_path, monkeypatch):
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: tmp_path / name)
     for i in range(25):
-        spec_text.keep("rig.csv", f"{i:012d}"[::-1], f"restarts = {i}")
+        spec_text.keep(spec_text.kept_name("rig.csv", f"{i:012d}"[::-1]), f"restarts = {i}")
         os.utime(spec_text.earlier()[0], (i, i))
-    spec_text.keep("rig.csv", f"{24:012d}"[::-1], "restarts = 99")
+    spec_text.keep(spec_text.kept_name("rig.csv", f"{24:012d}"[::-1]), "restarts = 99")
     kept = spec_text.earlier()
     assert len(kept) == 20 and kept[0].read_text() == "restarts = 99"
     assert {spec_text.kept_title(place) for place in kept} == {"rig.csv"}
     assert [file.suffix for file in kept[0].parent.iterdir()] == [".toml"] * 20
     monkeypatch.setattr("platformdirs.user_state_path", lambda name: kept[0])  # no folder
-    spec_text.keep("rig.csv", "key", "restarts = 1")
+    spec_text.keep("rig.csv-key", "restarts = 1")
     assert spec_text.earlier() == []
 
 

@@ -9,10 +9,62 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from typing import Any
 
 LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
+
+
+class Stage(StrEnum):
+    """Stages of a fit after its runs, in their order; a fit may omit some."""
+
+    CHOICE = "choosing between the runs"
+    SCORES = "scores"
+    INTERVALS = "intervals and residual tests"
+    VERDICT = "verdict on the learner"
+    DOUBTS = "unmodelled effects"
+    ADVICE = "trials of advice"
+    FIGURES = "figures"
+    REPORT = "report"
+
+    def enter(self) -> None:
+        """Log that a fit has come to this stage."""
+        _STAGE_LOG.info("%s", self.value)
+
+
+_STAGE_LOG, _MODEL_LOG = LOG.getChild("stage"), LOG.getChild("model")
+_MODEL_LOG.propagate = False  # its records are no text
+
+
+def show_model(name: str, fit: Callable[[], Any], record: Any) -> None:
+    """Hand a fit that training has reached to who follows this process.
+
+    Args:
+        fit: makes it, or None; it is called only where somebody follows.
+        record: the training data.
+    """
+    if not _MODEL_LOG.handlers:
+        return
+    try:
+        _MODEL_LOG.info("%s", name, extra={"fit": fit(), "record": record})
+    except Exception:  # it is shown only: training goes on
+        LOG.debug("a model of training cannot be shown", exc_info=True)
+
+
+def follow_training(
+    show_stage: Callable[[str], None], show_fit: Callable[[str, Any, Any], None]
+) -> None:
+    """Call functions with every stage, and every model with its record, of fits of this process."""
+    for log, show in (
+        (_STAGE_LOG, lambda record: show_stage(record.getMessage())),
+        (_MODEL_LOG, lambda record: show_fit(record.getMessage(), record.fit, record.record)),
+    ):
+        handler = logging.Handler()
+        handler.emit = show  # pyright: ignore[reportAttributeAccessIssue]
+        log.handlers[:] = [handler]
+        log.setLevel(logging.INFO)
+
 
 ProgressCallback = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop

@@ -14,6 +14,7 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
+from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
@@ -47,6 +48,7 @@ def doubt(made: E) -> E:
     fit, result = made.fit, made.result
     if not fit.status.ok:
         return made
+    Stage.DOUBTS.enter()
     failed: list[Any] = []
     test = attempt(
         "the search for a hidden state",

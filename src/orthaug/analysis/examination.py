@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.diagnosis import diagnose
@@ -77,6 +78,7 @@ def examine(fit: Any, evidence: Evidence) -> Examination:
 
 def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
     """Return a fit scored on every part, with the findings on it but verdict and doubts."""
+    Stage.SCORES.enter()
     warnings: list[Any] = [*evidence.warnings, *fit.warnings]
     scores, responses = {}, {}
     if fit.status.ok:
@@ -90,6 +92,7 @@ def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
     if fit.status.ok and one_step and fit.learns:
         chosen_by = [p.name for p in evidence.parts if not p.name.startswith("tests.")]
         warnings += _one_step_only(scores, alone, chosen_by)
+    Stage.INTERVALS.enter()
     fit, fields = _analyse(fit, evidence, responses, warnings)
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
@@ -345,6 +348,7 @@ def with_verdict(made: E) -> E:
     learns = fit.learns
     if not fit.status.ok or not (learns or fit.held_out is not None):
         return made
+    Stage.VERDICT.enter()
     failed: list[Any] = []
     physics = cache(partial(_physics_alone, fit))
     verdict = attempt(

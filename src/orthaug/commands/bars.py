@@ -11,10 +11,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from orthaug._base.progress import SILENT, Plan, Progress, ProgressCallback, StopTraining
+from orthaug._base.progress import (
+    SILENT,
+    Plan,
+    Progress,
+    ProgressCallback,
+    StopTraining,
+    follow_training,
+)
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
 from orthaug.commands.streams import say
@@ -34,6 +42,7 @@ ENOUGH_LINE = b"enough\n"
 GO_ON = "The finished runs are kept; the same command continues from there"
 """What an interrupted `reproduce` says last."""
 _OFTEN = 0.02  # s between such lines
+_SHOWN = 300  # rows of the free run of a model in such a line
 _MANY = 1_000_000  # rows from which the rate is shown
 _LONG = 5.0  # s of a search from which its duration is announced
 _SEEN = 3  # models after which the remaining time is shown: the first ones compile
@@ -120,6 +129,8 @@ class _Lines:
         self.runs, self.iterations = runs, iterations
         self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
+        if self._wanted:
+            follow_training(lambda stage: streams.say(json.dumps({"stage": stage})), _tell_model)
 
     def planned(self, first: int, plan: Plan) -> None:
         """Set the runs that follow from this number on."""
@@ -143,6 +154,29 @@ class _Lines:
                 {**fields, "loss": loss if math.isfinite(loss) else None, "done": share, **known}
             )
         )
+
+
+def _tell_model(name: str, fit: Any, record: Any) -> None:
+    """Write the free run of a model on the first rows of the training data, as a line of JSON."""
+    if fit is None or not fit.status.ok:
+        return
+    few = replace(record, experiments=record.experiments[:1]).rows(0, _SHOWN)
+    response = fit.model.simulate(few)
+    (run,) = response.trajectories
+    outputs = {
+        channel.name: {
+            "unit": channel.unit,
+            "measured": _finite(run.measured[:, j]),
+            "model": _finite(run.model[:, j]),
+        }
+        for j, channel in enumerate(response.outputs)
+    }
+    time = _finite(run.time(response.sampling_time))
+    streams.say(json.dumps({"model": name, "time": time, "outputs": outputs}))
+
+
+def _finite(values: Any) -> list[float | None]:
+    return [float(f"{v:.6g}") if math.isfinite(v) else None for v in values]
 
 
 @contextmanager

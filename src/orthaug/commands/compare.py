@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
-from orthaug._base.progress import SILENT, Progress
+from orthaug._base.progress import SILENT, Progress, Stage
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.examination import cross_validated, judge_fit
 from orthaug.analysis.fit_findings import parameter_rows
@@ -122,9 +122,11 @@ def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
                 place = partial / "models" / kind.replace(" ", "-")
                 place.mkdir(parents=True)
                 storage.write(fitted.fit.model, place)
+        Stage.FIGURES.enter()
         (partial / "figures").mkdir()
         figure = plots.comparison_figure(comparison.result.comparison)
         plots.save(figure, partial / "figures" / "comparison.png")
+        Stage.REPORT.enter()
         (partial / "report.html").write_text(compare_report(comparison), encoding="utf-8")
 
 

@@ -69,23 +69,27 @@ def run(folder: Path, progress: Progress = SILENT, *, force: bool = False) -> st
     """
     example = mass_spring_damper()
     with whole_folder(folder, force=force) as partial:
-        for name, record in (("train", example.train), ("test", example.test)):
-            experiment = record.experiments[0]
-            table = np.column_stack([experiment.inputs, experiment.outputs])
-            np.savetxt(
-                partial / f"{name}.csv",
-                table,
-                fmt="%.17g",
-                delimiter=",",
-                header="force,position",
-                comments="",
-            )
+        write_records(example, partial)
         (partial / "spec.toml").write_text(SPEC, encoding="utf-8")
         job = open_job(partial / "spec.toml")
         orthogonal = fit_job(job, progress)
         additive = [_additive(example, seed, progress) for seed in range(RESTARTS)]
         fill_result(orthogonal, partial)
     return _comparison(example, orthogonal, additive)
+
+
+def write_records(example: Example, folder: Path) -> None:
+    """Write the files that the spec names."""
+    for name, record in (("train", example.train), ("test", example.test)):
+        experiment = record.experiments[0]
+        np.savetxt(
+            folder / f"{name}.csv",
+            np.column_stack([experiment.inputs, experiment.outputs]),
+            fmt="%.17g",
+            delimiter=",",
+            header="force,position",
+            comments="",
+        )
 
 
 def _additive(example: Example, seed: int, progress: Progress) -> LaggedEstimate:

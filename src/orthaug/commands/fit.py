@@ -10,7 +10,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import release_programs
 from orthaug._base.parallel import one_blas_thread
-from orthaug._base.progress import SILENT, Progress
+from orthaug._base.progress import SILENT, Progress, Stage
 from orthaug._base.views import MAKERS
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.doubts import doubt
@@ -70,6 +70,7 @@ def with_advice(fitted: FitReport) -> FitReport:
 
     if not fitted.fit.status.ok or was_stopped(fitted.fit):
         return fitted
+    Stage.ADVICE.enter()
     failed: list[Any] = []
     found = attempt(
         "the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None
@@ -177,8 +178,10 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     if physics is not None and physics.status.ok:
         (folder / PHYSICS).mkdir()
         storage.write(physics.model, folder / PHYSICS)
+    Stage.FIGURES.enter()
     (folder / "figures").mkdir()
     _draw(fitted, folder / "figures")
+    Stage.REPORT.enter()
     (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")
 
 

@@ -128,7 +128,7 @@ def spec_text(
         linear = "linear difference equations, to be replaced by what you know"
         document.add(tomlkit.comment(f"The physics: {linear} ([motion]: equations of motion)."))
         document.add("baseline", _baseline(named, model))
-        sees = "the lags that the physics reads; [lags] gives it more, `inputs` fewer"
+        sees = "the lags that the physics reads; [lags] gives it more, learner.inputs fewer"
     else:
         document.add(tomlkit.comment("The physics: equations of motion, for you to change."))
         document.add("motion", motion_section(motion))
@@ -270,13 +270,10 @@ def assign(
     inputs: Names | None,
     outputs: Names | None,
     sampling_time: float | None = None,
-    *,
-    guess: bool = True,
 ) -> Roles | None:
     """Return the columns by name; where none are given, by the meaning of their names.
 
-    Where the names leave that open, by what predicts what in the data; None if that is
-    open, too, or no `guess` is wanted.
+    Where the names leave that open, by what predicts what in the data; None if that is open, too.
 
     Raises:
         InputError: columns that are not there, twice, constant or the time.
@@ -285,7 +282,7 @@ def assign(
         known = found.roles()
         if known is not None:
             return Roles(tuple(known[0]), tuple(known[1]), sampling_time)
-        guessed = guess_roles(found.signals) if guess and not found.contradicted else None
+        guessed = None if found.contradicted else guess_roles(found.signals)
         if guessed is None:
             return None
         return Roles(guessed.inputs, guessed.outputs, sampling_time, str(guessed))
@@ -561,7 +558,11 @@ def _account(
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}
     doubtful = [one for one in found.clock.refused if one.signal or id(one.column) in used]
-    lines += [roles.reason] if roles.reason else []
+    if roles.reason:
+        lines.append(
+            f"inputs and outputs are guessed: {roles.reason}; where that is wrong, choose them "
+            "(--inputs, --outputs)"
+        )
     lines[2:2] = [f"not the time: column '{one.column.header}' {one.reason}" for one in doubtful]
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")

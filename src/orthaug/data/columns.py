@@ -19,6 +19,15 @@ from orthaug.data.steps import Outliers
 
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
 _OUTPUT = re.compile(r"^(y|y_?\d+|out|output|output_?\d+)$", re.IGNORECASE)
+# Quantities that are mostly applied, and mostly measured
+_APPLIED = re.compile(
+    r"force|torque|voltage|command|set_?point|valve|pump|heater|power|throttle|duty|pwm",
+    re.IGNORECASE,
+)
+_MEASURED = re.compile(
+    r"position|displacement|deflection|angle|speed|velocity|acceleration|level|height|temperature",
+    re.IGNORECASE,
+)
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
@@ -138,6 +147,14 @@ class Column:
         """'input' or 'output' where the name shows it, otherwise ''."""
         name = channel_name(last_part(split_header(self.header)[0]))
         return "input" if _INPUT.match(name) else "output" if _OUTPUT.match(name) else ""
+
+    @property
+    def proposed(self) -> str:
+        """'input' or 'output' where the name shows or suggests it, otherwise ''."""
+        applied, measured = _APPLIED.search(self.header), _MEASURED.search(self.header)
+        if self.kind or bool(applied) == bool(measured):
+            return self.kind
+        return "input" if applied else "output"
 
 
 def quantum_of(values: Vector) -> float | None:

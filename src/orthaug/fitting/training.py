@@ -15,7 +15,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import LOG, ProgressCallback
+from orthaug._base.progress import LOG, ProgressCallback, Stage, show_model
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Restart
 from orthaug.fitting.held_out import (
@@ -135,6 +135,8 @@ def train(
     """
     with one_blas_thread():
         task = task.prepare(solver, structure, partial(progress, 0))
+    alone = partial(_physics_to_compare, task, structure)
+    show_model("physics alone", alone, task.problem.record)
     LOG.info("training: %d runs of %s, %s", len(starts), type(solver).__name__, structure.name)
     planned, (starts, runs) = (
         len(starts),
@@ -149,6 +151,7 @@ def train(
     )
     if untried:  # who asks to end does not wait for runs on held-out blocks
         choice = replace(choice, blocks=0)
+    Stage.CHOICE.enter()
     held_out = _held_out(task, starts, runs, concluded, structure, solver, choice, runner)
     errors = (
         [math.nan] * len(runs) if held_out is None else [mean_square(run) for run in held_out.runs]
@@ -276,8 +279,12 @@ def _run(
     runner: Any,
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Return every planned run; one that fails is made again from the seeds that follow."""
-    made, given = list(starts), (task, solver, structure)
-    runs = list(runner.map(_one_run, given, made, progress))
+    made, given, record = list(starts), (task, solver, structure), task.problem.record
+    runs: list[Any] = []
+    for run in runner.map(_one_run, given, made, progress):
+        runs.append(run)
+        if task.loss(run) <= min(map(task.loss, runs)) and not hasattr(task.problem, "source"):
+            show_model(structure.name, partial(_conclude_briefly, task, structure, run), record)
     for i, (start, run) in enumerate(zip(made, runs, strict=True), 1):
         figures = (i, start.seed, run.ending.code, run.iterations, task.loss(run), run.seconds)
         LOG.info("run %d, seed %d: %s after %d iterations, loss %.4g, %.2f s", *figures)
@@ -295,6 +302,10 @@ def _run(
     ]
     more = runner.map(_one_run, given, again, lambda i, *at: progress(len(made) + i, *at))
     return made + again, runs + list(more)
+
+
+def _conclude_briefly(task: Task, structure: Structure, run: Any) -> Any:
+    return task.conclude(structure, task.learned(run), briefly=True)
 
 
 def _one_run(

@@ -35,13 +35,10 @@ class Guess:
     outputs: tuple[Column, ...]
 
     def __str__(self) -> str:
-        """Return the reason, as a sentence."""
+        """Return the reason, as a clause."""
         causes = " and ".join(f"'{c.header}'" for c in self.inputs)
         effects = " and ".join(f"'{c.header}'" for c in self.outputs)
-        return (
-            f"inputs and outputs are guessed: past values of {causes} help to predict {effects}, "
-            "but not the reverse; where that is wrong, choose them (--inputs, --outputs)"
-        )
+        return f"past values of {causes} help to predict {effects}, but not the reverse"
 
 
 def guess_roles(columns: Sequence[Column]) -> Guess | None:

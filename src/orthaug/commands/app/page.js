@@ -51,6 +51,10 @@ new MutationObserver(() => {
     frame.dataset.seen = "";
     frames.observe(frame);
   }
+  for (const panel of document.querySelectorAll(".sticky:not([data-seen])")) {
+    panel.dataset.seen = "";
+    panels.observe(panel);
+  }
   for (const plot of document.querySelectorAll(".plot:not([data-fit])")) {
     plot.dataset.fit = "";
     widths.observe(plot);
@@ -86,10 +90,80 @@ setInterval(() => {
 }, 100);
 
 // The part that is shown stands behind # in the address, so that Back and Forward go through the parts.
+// Each part is found again as it was left, after a reload too: where it was scrolled to, and what was typed.
+history.scrollRestoration = "manual";
+const memory = (what) => `${what} ${location.pathname} ${location.hash}`;
+let arriving = 0; // until when the place of a part is sought, while it is still being drawn
 function shown(part, first) {
-  if (location.hash === `#${part}`) return;
-  history[first ? "replaceState" : "pushState"](history.state, "", `#${part}`);
+  if (location.hash !== `#${part}`) history[first ? "replaceState" : "pushState"](history.state, "", `#${part}`);
+  arrive();
 }
+function arrive() {
+  const place = +sessionStorage.getItem(memory("scroll"));
+  arriving = Date.now() + 3000;
+  const seek = () => {
+    scrollTo(0, place);
+    if (Math.abs(scrollY - place) < 2) arriving = place ? arriving : 0;
+    if (Date.now() < arriving) requestAnimationFrame(seek);
+  };
+  requestAnimationFrame(seek);
+}
+for (const name of ["wheel", "pointerdown", "keydown", "touchstart"]) addEventListener(name, () => (arriving = 0), { passive: true });
+function keepScroll(key) {
+  if (Date.now() >= arriving && key === memory("scroll")) sessionStorage.setItem(key, Math.round(scrollY));
+}
+let scrolled = 0; // a part that is being left must not keep where the next one stands
+addEventListener("scroll", () => {
+  clearTimeout(scrolled);
+  scrolled = setTimeout(keepScroll, 400, memory("scroll"));
+});
+addEventListener("pagehide", () => keepScroll(memory("scroll")));
+addEventListener("load", arrive);
 addEventListener("popstate", () => {
-  if (location.hash) emitEvent("part", location.hash.slice(1));
+  if (!location.hash) return;
+  emitEvent("part", location.hash.slice(1));
+  arrive();
+});
+
+// What is in a field and was not taken yet, under the name of the field.
+const TYPED = "input:not([type=file]), textarea";
+const drafts = () => JSON.parse(sessionStorage.getItem(memory("typed")) ?? "{}");
+function keepDraft(control, value) {
+  const all = drafts();
+  if (value === null) delete all[called(control)];
+  else all[called(control)] = value;
+  sessionStorage.setItem(memory("typed"), JSON.stringify(all));
+}
+const taken = new WeakMap();
+addEventListener("input", ({ target }) => {
+  if (!target.matches?.(TYPED)) return;
+  keepDraft(target, target.value);
+  clearTimeout(taken.get(target)); // the text of the spec is taken while it is written
+  if (target.closest(".editor")) taken.set(target, setTimeout(keepDraft, 1500, target, null));
+});
+addEventListener("change", ({ target }) => target.matches?.(TYPED) && keepDraft(target, null));
+const returning = setInterval(() => {
+  for (const control of document.querySelectorAll(TYPED)) {
+    const text = control.dataset.back === undefined ? drafts()[called(control)] : undefined;
+    if (text === undefined) continue;
+    control.dataset.back = "";
+    if (text === control.value) continue;
+    control.value = text;
+    control.dispatchEvent(new InputEvent("input", { bubbles: true }));
+  }
+}, 200);
+addEventListener("load", () => setTimeout(() => clearInterval(returning), 5000));
+
+// A panel beside the page stays in sight; one that is taller than the window goes up until its end is seen.
+const panels = new ResizeObserver((entries) => entries.forEach(({ target }) => settle(target)));
+function settle(panel) {
+  panel.style.top = `${Math.min(64, innerHeight - panel.offsetHeight - 16)}px`;
+}
+addEventListener("resize", () => document.querySelectorAll(".sticky").forEach(settle));
+
+// Undo and redo of the spec; in a field the keys are those of its own text.
+addEventListener("keydown", (event) => {
+  if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z" || event.target.closest("input, textarea")) return;
+  event.preventDefault();
+  emitEvent(event.shiftKey ? "redo" : "undo");
 });

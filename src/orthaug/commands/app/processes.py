@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import InputError
+from orthaug._base.progress import Stage
 from orthaug.commands.bars import ENOUGH_LINE, PROGRESS_VARIABLE
 
 _LONGEST = 2**26  # bytes of a line of an answer
@@ -46,6 +47,10 @@ class Command:
     """The last progress: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
     losses: list[tuple[Run, int, float | None]] = field(default_factory=list)
     """(run, iteration, loss) of each line of progress."""
+    stage: Stage | None = None
+    """The stage after the runs that it has come to."""
+    models: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """By name, the free run of physics alone and of the best run so far: `time`, `outputs`."""
     lines: list[str] = field(default_factory=list)
     began: float = 0.0
     ended: float | None = None
@@ -108,14 +113,26 @@ class Command:
             self.finish()
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
-            progress = _progress(line)
-            if progress is None:
+            told = _told(line)
+            if told is None:
                 self.lines = [*self.lines, line][-_LINES:]
+            elif "stage" in told:
+                self._enter(Stage(told["stage"]))
+            elif "model" in told:
+                if self.stage is None:  # else it is of a trial
+                    self.models.pop(told["model"], None)
+                    self.models[told["model"]] = told
             else:
-                self.progress = progress
-                self.losses.append((Run.of(progress), progress["iteration"], progress["loss"]))
+                self.progress, self.stage = told, None
+                self.losses.append((Run.of(told), told["iteration"], told["loss"]))
             self.changed()
         return await self.process.wait()
+
+    def _enter(self, stage: Stage) -> None:
+        """Go on to a stage; a trial of advice comes to earlier ones again, which are part of it."""
+        order = list(Stage)
+        if self.stage is None or order.index(stage) > order.index(self.stage):
+            self.stage = stage
 
     def stop(self) -> None:
         """Interrupt the command: it keeps or removes partial files, and ends."""
@@ -139,9 +156,10 @@ class Command:
                 _kill(self.process)
 
 
-def _progress(line: str) -> dict[str, Any] | None:
+def _told(line: str) -> dict[str, Any] | None:
+    """Return what a line tells of the training: a run, a stage or a model; None for others."""
     with suppress(ValueError):
-        return json.loads(line) if line.startswith('{"run"') else None
+        return json.loads(line) if line.startswith(('{"run"', '{"stage"', '{"model"')) else None
     return None
 
 

@@ -26,7 +26,7 @@ from orthaug.commands.app.view_data import DataView
 from orthaug.commands.app.view_model import ModelView
 from orthaug.commands.app.view_results import ExportView, ReportView
 from orthaug.commands.app.view_training import TrainingView
-from orthaug.commands.app.widgets import sentence, text
+from orthaug.commands.app.widgets import button, sentence, text
 
 LARGEST = 2 * 2**30  # bytes of an upload: there is a second copy in a temporary folder
 _TOO_LARGE = "the file is larger than {}, the limit of this page; give its path instead."
@@ -52,6 +52,7 @@ class Page:
             ReportView(session),
             ExportView(session),
         )
+        self.onward: dict[str, tuple[ui.html, ui.button]] = {}
         self.seen = dict(session.versions)
 
     def draw(self) -> None:
@@ -63,6 +64,11 @@ class Page:
             ui.html(MARK, sanitize=False, tag="span").classes("logo").props("aria-hidden=true")
             text("orthaug", "h1")
             self.title = text("", "p", "hint")
+            with ui.element("div").classes("history"):
+                self.undo = button("Undo", self.session.undo).props("aria-keyshortcuts=Control+Z")
+                self.redo = button("Redo", self.session.redo)
+                self.redo.props("aria-keyshortcuts=Control+Shift+Z")
+        start = "Training" if self.session.commands or self.session.shown else "Data"
         with (
             ui.tabs()
             .props("no-caps align=left active-color=tab indicator-color=tab dense")
@@ -70,15 +76,25 @@ class Page:
         ):
             for name in _PARTS:
                 ui.tab(name)
-        start = "Training" if self.session.commands else "Data"
+        tabs.set_value(start)  # before anyone follows: a later one would count as a change
         self._keep_history(tabs, start)
         parts = (self.data, self.model, self.training, self.report, self.export)
         with ui.tab_panels(tabs, value=start).props("animated=false").classes("parts"):
             for name, part in zip(_PARTS, parts, strict=True):
                 with ui.tab_panel(name):
                     part.draw()
+                    if name != _PARTS[-1]:
+                        self._draw_next(name, tabs)
         self._name()
         ui.timer(_OFTEN, self.follow)
+
+    def _draw_next(self, part: str, tabs: ui.tabs) -> None:
+        """Draw the button that leads to the next part, with what is missing before it."""
+        following = _PARTS[_PARTS.index(part) + 1]
+        with ui.element("div").classes("onward"):
+            lacking = text("", "p", "hint")
+            onward = button(f"Continue to {following}", lambda: tabs.set_value(following))
+        self.onward[part] = (lacking, onward)
 
     def _keep_history(self, tabs: ui.tabs, start: str) -> None:
         """Let the browser's Back, Forward and reload lead to the part that was shown."""
@@ -93,6 +109,8 @@ class Page:
 
         ui.on("part", go)
         ui.on("reopened", reopen)
+        ui.on("undo", self.session.undo)
+        ui.on("redo", self.session.redo)
         tabs.on_value_change(
             lambda event: ui.run_javascript(f"shown({json.dumps(str(event.value))}, false)")
         )
@@ -128,6 +146,8 @@ class Page:
             looks.append(self.training.follow_work)
         elif has_moved("check"):
             looks.append(self.training.follow_check)
+        if has_moved("work") or self.session.starting is not None:
+            looks.append(self.model.follow_work)
         if has_moved("work") or has_moved("spec"):
             looks += [self.report.follow_work, self.export.follow_work]
         if now != seen:
@@ -140,7 +160,15 @@ class Page:
                 self._complain(error)
 
     def _name(self) -> None:
-        self.title.set_content(escape(self.session.title or "from data to a model"))
+        session = self.session
+        self.title.set_content(escape(session.title or "from data to a model"))
+        for made, there in ((self.undo, session.earlier), (self.redo, session.undone)):
+            made.set_visibility(bool(session.spec.strip()))
+            made.set_enabled(bool(there))
+        for part, (lacking, onward) in self.onward.items():
+            why = session.missing(part)
+            lacking.set_content(escape(why))
+            onward.set_enabled(not why)
 
     def _complain(self, error: Exception) -> None:
         message = (
@@ -148,7 +176,7 @@ class Page:
             if isinstance(error, InputError)
             else f"this did not work ({type(error).__name__})."
         )
-        ui.notify(sentence(message), type="negative")
+        ui.notify(sentence(message).replace("`", ""), type="negative")
 
 
 def application(sessions: Sessions, spec: Path | None) -> FastAPI:

@@ -11,9 +11,10 @@ import os
 import re
 import secrets
 import shutil
+import time
 import zipfile
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -22,21 +23,27 @@ from typing import Any
 from orthaug._base.errors import InputError
 from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
+from orthaug.commands.app.kept_results import KeptResult, keep_result, kept_results
 from orthaug.commands.app.processes import Command, WorkerPool
 from orthaug.commands.app.spec_text import (
+    Shelf,
     absolute,
     files,
     in_file,
     keep,
+    kept_name,
     kept_title,
     plain,
+    results_folder,
     section,
+    with_physics,
     with_value,
 )
 from orthaug.data.tables import KNOWN
 
 _SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
+_TYPING = 2.0  # s between two changes in the editor that are undone together
 KINDS = ("fit", "compare")
 
 
@@ -62,9 +69,20 @@ class Session:
         """Why the chosen channels make no spec."""
         self.spec = ""
         self.kept_as = ""
-        """The title under which its spec is kept when the server ends; empty until there is
-        something to keep.
+        """The name under which its spec and its results are kept when the server ends; empty
+        until there is something to keep.
         """
+        self.undone: list[str] = []
+        """Specs that redo brings back, the next one last."""
+        self.earlier: list[str] = []
+        """Specs that undo brings back, the next one last."""
+        self.shelf: Shelf = {}
+        """By kind of physics, what the spec had of it before another kind took its place."""
+        self._typed = 0.0
+        self.starting: float | None = None
+        """When the estimation of initial values began that runs now."""
+        self.start_trouble = ""
+        """Why there are no new initial values."""
         self.authors: list[str] = []
         """Author of each change of the spec: a part of a page, which ignores its own changes."""
         self.checked: dict[str, Any] | None = None
@@ -79,6 +97,14 @@ class Session:
         self.results: dict[str, dict[str, Any]] = {}
         self.verdicts: dict[str, dict[str, Any]] = {}
         """Of each result: `level` and `sentences`, as its report begins."""
+        self.kept: list[KeptResult] = []
+        """Results of this spec, the oldest first."""
+        self.shown: dict[str, int] = {}
+        """By kind, the number of the kept result that is shown."""
+        self.curves: dict[str, dict[str, Any]] = {}
+        """Of each result, and of a pair, what the worker's `free_runs` gives."""
+        self.pair: tuple[KeptResult, ...] = ()
+        """Two fits that are compared."""
         self.exports: dict[str, str] = {}
         """By target, why there is none; empty where there is."""
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -117,6 +143,21 @@ class Session:
             if self.found is None
             else "Choose the channels in Data first."
         )
+
+    def missing(self, part: str) -> str:
+        """Return what is missing before a part of the page is done; empty where nothing is."""
+        if not self.spec.strip():
+            begin = part == "Data" and self.found is not None
+            return "Begin with the channels first." if begin else self.first_step
+        if part == "Model" and self.checking:
+            return "The spec is being checked."
+        if part == "Model" and self.refused:
+            return "The spec cannot be trained yet: Check says why."
+        if part in ("Training", "Report") and self.running is not None:
+            return "Training is still running."
+        if part in ("Training", "Report") and not self.results:
+            return "Nothing has been trained yet."
+        return ""
 
     # Data
 
@@ -170,6 +211,23 @@ class Session:
         self._look_again(None, None, None)
         if self.spec.strip():  # it may name this file
             self._check_soon()
+
+    def try_example(self) -> None:
+        """Begin with the records and the spec of the built-in example."""
+        self.start(self._make_example())
+
+    async def _make_example(self) -> None:
+        self.looking, self.trouble = "Writing the records …", ""
+        self.mark_changed("data")
+        try:
+            spec = (await self.desk.ask("example", folder=self.folder))["spec"]
+        except InputError as error:
+            self.looking, self.trouble = "", self.reword(error)
+            self.mark_changed("data")
+            return
+        self.title = "mass, spring and damper"
+        self.write(spec, "example")
+        self.open_file(self.folder / "train.csv")
 
     def choose(self, inputs: Sequence[str], outputs: Sequence[str], step: float | None) -> None:
         """Begin the spec anew with these columns."""
@@ -256,8 +314,14 @@ class Session:
             else absolute(in_file(path), path.absolute().parent)
         )
         self.title = kept_title(path) if kept else path.name
+        self.kept_as = path.stem if kept else ""
         self.write(text, "file")
         self.mark_changed("data")
+        if kept:
+            self.kept = kept_results(self._results_folder)
+            for kind in KINDS:
+                if own := [result for result in self.kept if result.kind == kind]:
+                    self.show_result(own[-1])
 
     # Spec
 
@@ -265,17 +329,70 @@ class Session:
         """Take a new text of the spec; check it when it has not changed for a moment."""
         if text == self.spec:
             return
+        now = time.monotonic()
+        typing = author == "editor" and now - self._typed < _TYPING
+        self._typed = now if author == "editor" else 0.0
+        if self.spec.strip() and not (typing and self.earlier):
+            self.earlier.append(self.spec)
+        self.undone.clear()
+        self._take(text, author)
+
+    def undo(self) -> None:
+        """Take back the last change of the spec."""
+        self._go(self.earlier, self.undone)
+
+    def redo(self) -> None:
+        """Make the change again that was taken back last."""
+        self._go(self.undone, self.earlier)
+
+    def _go(self, there: list[str], back: list[str]) -> None:
+        if there:
+            back.append(self.spec)
+            self._typed = 0.0
+            self._take(there.pop(), "history")
+
+    def _take(self, text: str, author: str) -> None:
         self.spec = text
         self.authors.append(author)
         self.mark_changed("spec")
         if author != "file" and text.strip():
-            self.kept_as = self.kept_as or _as_name(self.title) or "spec"
-            keep(self.kept_as, self.key, text)
+            self._keep_spec()
         self._check_soon()
+
+    def _keep_spec(self) -> None:
+        self.kept_as = self.kept_as or kept_name(_as_name(self.title) or "spec", self.key)
+        keep(self.kept_as, self.spec)
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
         """Replace the spec by the result of a function of `spec_text` with these arguments."""
         self.write(change(self.spec, *given), author)
+
+    def choose_physics(self, kind: str) -> None:
+        """Write the physics as `terms` or as equations of `motion`; the other kind is kept."""
+        self.edit("physics", with_physics, kind, self.shelf)
+
+    def estimate_starts(self) -> None:
+        """Estimate initial values of a motion from the data, and write them into the spec."""
+        self.starting, self.start_trouble = time.monotonic(), ""
+        self.mark_changed("work")
+        self.start(self._estimate_starts(self.spec))
+
+    async def _estimate_starts(self, begun: str) -> None:
+        place = self.folder / "starts.toml"
+        place.write_text(begun, encoding="utf-8")
+        try:
+            spec, found = begun, await self.desk.ask("starts", path=place)
+            for name, value in found["values"].items():
+                spec = with_value(spec, ("motion", "parameters", name, "initial"), value)
+            if self.spec == begun:
+                self.write(spec, "starts")
+            else:
+                self.start_trouble = "the spec has changed meanwhile; estimate them again."
+        except InputError as error:
+            self.start_trouble = self.reword(error)
+        finally:
+            self.starting = None
+            self.mark_changed("work")
 
     def _check_soon(self) -> None:
         if self._check is not None:
@@ -323,11 +440,8 @@ class Session:
 
     def reword(self, text: Any) -> str:
         """Return a message without the session's own folder and file names."""
-        text = (
-            str(text)
-            .removeprefix(f"{self.folder / 'check.toml'}: ")
-            .removeprefix(f"{self.folder / 'spec.toml'}: ")
-        )
+        own = re.escape(f"{self.folder}{os.sep}")
+        text = re.sub(rf"^{own}[\w-]+\.toml: ", "", str(text))
         return text.replace(f"{self.folder}/", "").replace(f"{self.folder}\\", "")
 
     # Training
@@ -356,17 +470,70 @@ class Session:
     async def _follow_run(self, kind: str, command: Command, spec: str) -> None:
         await command.run()
         if command.code == 0:
-            self.trained[kind] = spec
-            await self._read_result(kind)
+            self._keep_spec()
+            try:
+                keep_result(self._results_folder, kind, self.folder / kind, spec)
+            except OSError:  # it is shown all the same
+                self.trouble = "The result could not be kept beside the others."
+            self.kept = kept_results(self._results_folder)
+            self.shown[kind] = self.kept[-1].number if self.kept else 0
+            await self._read_result(kind, spec)
         self.mark_changed("work")
 
-    async def _read_result(self, kind: str) -> None:
-        """Read the result in the folder, and the verdict that its report begins with."""
+    @property
+    def _results_folder(self) -> Path:
+        return results_folder(self.kept_as)
+
+    async def _read_result(self, kind: str, spec: str) -> None:
+        """Read the result in the folder, the verdict of its report, and its free runs."""
         place = self.folder / kind / "result.json"
+        self.trained[kind] = spec
         self.verdicts.pop(kind, None)
+        self.curves.pop(kind, None)
+        self.exports.clear()
         with suppress(OSError, ValueError):  # InputError among them
             self.results[kind] = json.loads(place.read_text(encoding="utf-8"))
             self.verdicts[kind] = await self.desk.ask("verdict", path=place, kind=kind)
+        self.mark_changed("work")
+        models = {folder.name: folder for folder in sorted((place.parent / "models").glob("*"))}
+        fitted = {"model": place.parent / "model", "physics alone": place.parent / "model-physics"}
+        await self._run_freely(kind, spec, models or fitted)
+
+    async def _run_freely(self, what: str, spec: str, models: Mapping[str, Path]) -> None:
+        """Ask for the free runs of saved models on the data of a spec."""
+        place = self.folder / f"{what}-runs.toml"
+        place.write_text(spec, encoding="utf-8")
+        there = {name: folder for name, folder in models.items() if folder.is_dir()}
+        try:
+            self.curves[what] = await self.desk.ask("free_runs", path=place, models=there)
+        except InputError as error:
+            self.curves[what] = {"refused": self.reword(error)}
+        self.mark_changed("work")
+
+    def show_result(self, kept: KeptResult, *, with_spec: bool = False) -> None:
+        """Show a kept result again; `with_spec` makes its spec the present one."""
+        if self.running is not None:
+            return
+        place = self.folder / kept.kind
+        shutil.rmtree(place, ignore_errors=True)
+        shutil.copytree(kept.folder, place)
+        (place / "spec.toml").unlink(missing_ok=True)  # it is no part of what the command writes
+        self.shown[kept.kind] = kept.number
+        if with_spec:
+            self.write(kept.spec, "kept")
+        self.start(self._read_result(kept.kind, kept.spec))
+
+    def choose_pair(self, kept: KeptResult, chosen: bool) -> None:
+        """Take a fit into the pair that is compared, or out of it; of three the first one goes."""
+        if chosen == (kept in self.pair):
+            return
+        others = tuple(one for one in self.pair if one.number != kept.number)
+        self.pair = (*others, kept)[-2:] if chosen else others
+        self.curves.pop("pair", None)
+        self.mark_changed("work")
+        if len(self.pair) == 2:
+            models = {one.name: one.folder / "model" for one in self.pair}
+            self.start(self._run_freely("pair", self.pair[-1].spec, models))
 
     def stop(self) -> None:
         """Interrupt the training that runs now."""
@@ -431,6 +598,10 @@ class Session:
             if task is self._check or task is self._look:
                 task.cancel()
         await asyncio.gather(*(command.end() for command in self.commands.values()))
+        rest = list(self._tasks)
+        for task in rest:
+            task.cancel()
+        await asyncio.gather(*rest, return_exceptions=True)
 
 
 class Sessions:

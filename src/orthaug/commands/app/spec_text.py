@@ -6,6 +6,8 @@ And the files where specs are kept.
 from __future__ import annotations
 
 import os
+import re
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,7 +22,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.tables import check_readable
 
 # Keys whose values are text, digits or not
-_WORDS = ("parameter", "regressor", "output", "unit", "channel")
+_WORDS = ("parameter", "regressor", "output", "unit", "channel", "derivative", "next")
 _KEPT = 20  # specs of earlier work
 _MARK = 7  # letters behind the title in the name of one
 
@@ -56,19 +58,30 @@ def in_file(path: Path) -> str:
     return text
 
 
-def keep(title: str, key: str, spec: str) -> None:
-    """Write the spec of a session anew, whole or not at all.
+def keep(name: str, spec: str) -> None:
+    """Write the spec of a session anew, whole or not at all; the oldest ones and their results go.
 
     It does nothing where the folder cannot be written.
     """
-    place = _folder() / f"{title}-{key[: _MARK - 1]}.toml"
+    place = results_folder(name).with_name(f"{name}.toml")
     with suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
         partial = place.with_suffix(".partial")
         partial.write_text(spec, encoding="utf-8")
         os.replace(partial, place)
         for old in earlier()[_KEPT:]:
+            shutil.rmtree(results_folder(old.stem), ignore_errors=True)
             old.unlink(missing_ok=True)
+
+
+def kept_name(title: str, key: str) -> str:
+    """Return the name under which a session keeps its spec and its results."""
+    return f"{title}-{key[: _MARK - 1]}"
+
+
+def results_folder(name: str) -> Path:
+    """Return the folder of the results of a spec that is kept under a name."""
+    return _folder() / name
 
 
 def earlier() -> list[Path]:
@@ -229,6 +242,40 @@ def with_value(text: str, path: Sequence[str], value: Any) -> str:
     return edit_text(text, change)
 
 
+def with_name(text: str, path: Sequence[str], new: str) -> str:
+    """Return the text with another name for a state or a parameter of a motion, in its expressions.
+
+    Raises:
+        InputError: a name that is taken, or is none.
+    """
+    *above, old = path
+    known = section(plain(text), *above)
+    if new == old:
+        return text
+    if not re.fullmatch(r"[A-Za-z]\w*", new, re.ASCII) or new in known:
+        raise InputError(f"'{new}' is taken, or no name: letters, digits and underscores.")
+
+    def renamed(value: Any) -> Any:
+        own = rf"\b{re.escape(old)}\b"
+        return re.sub(own, new, value) if isinstance(value, str) else value
+
+    def change(document: Any) -> None:
+        table = _table_at(document, above)
+        for name, row in [(name, table.pop(name)) for name in list(table)]:
+            table[new if name == old else name] = row
+        motion = document["motion"]
+        for row in motion.get("states", {}).values():
+            row |= {key: renamed(row[key]) for key in ("derivative", "next") if key in row}
+        for part in ("outputs", "define"):
+            for name, value in section(motion, part).items():
+                motion[part][name] = renamed(value)
+        seen = section(document, "learner").get("inputs")
+        if isinstance(seen, list):
+            document["learner"]["inputs"] = [renamed(value) for value in seen]
+
+    return edit_text(text, change)
+
+
 def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
     """Return the tables of a list of tables, such as `data.prepare`.
 
@@ -295,6 +342,12 @@ _OF_TERMS = (
     'focus = "simulation"',
 )
 """Phrases of comments by `orthaug init` that do not hold for equations of motion."""
+TERM = """
+[[baseline.terms]]
+parameter = "{parameter}"
+regressor = "{regressor}"
+output = "{output}"
+"""
 MOTION = """
 [motion]
 [motion.states]
@@ -310,15 +363,59 @@ k = {{ initial = 1.0{k}, min = 0 }}
 """
 
 
-def as_motion(text: str) -> str:
-    """Return the spec with the equations of a mass, spring and damper in place of the baseline.
+Shelf = dict[str, dict[tuple[str, ...], Any]]
+"""By kind of physics, what a spec had under each path before another kind took its place."""
+_OF_PHYSICS = (
+    *(("baseline",), ("lags",), ("physics",), ("suspects",), ("motion",), ("learner", "inputs")),
+    *(("learner", "terms"), ("training", "focus")),
+)
+"""What of a spec belongs to one kind of physics alone."""
 
-    The user is to change them.
 
-    Comments on the baseline are removed; parameters get units where force and output have units.
+def kind_of_physics(content: Mapping[str, Any]) -> str:
+    """Return the kind of physics of a spec: `terms`, `motion` or `source`."""
+    if section(content, "physics", "source"):
+        return "source"
+    return "motion" if "motion" in content else "terms"
+
+
+def with_physics(text: str, kind: str, shelf: Shelf) -> str:
+    """Return the spec with `terms` or equations of `motion` as its physics.
+
+    What it has of the present kind is put on the shelf; what lies there of the other is taken.
+    Without it the equations are those of a mass, spring and damper, which the user is to change,
+    with units where force and output have them.
     """
+    present = kind_of_physics(plain(text))
+    if kind == present:
+        return text
+    taken: dict[tuple[str, ...], Any] = {}
+    known = shelf.get(kind) or _first_physics(text, kind)
+
+    def change(document: Any) -> None:
+        for *above, key in _OF_PHYSICS:
+            table = section(document, *above) if above else document
+            if key in table:
+                taken[(*above, key)] = table.pop(key)  # pyright: ignore[reportAttributeAccessIssue]
+        for path, value in known.items():
+            _make_table(document, path[:-1])[path[-1]] = value
+
+    made = edit_text(_without_comments(text, _OF_TERMS), change)
+    shelf[present] = taken
+    return made
+
+
+def _first_physics(text: str, kind: str) -> dict[tuple[str, ...], Any]:
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
+    if kind == "terms":
+        rows = [
+            TERM.format(parameter=f"p{i}", regressor=regressor, output=output)
+            for i, (output, regressor) in enumerate(
+                ((output, f"{name}[k-1]") for output in outputs for name in (output, inputs[0])), 1
+            )
+        ]
+        return {("baseline",): tomlkit.parse("".join(rows))["baseline"]}
     force, output = (
         section(data, "channels", name).get("unit") for name in (inputs[0], outputs[0])
     )
@@ -326,16 +423,8 @@ def as_motion(text: str) -> str:
         _motion_units(force, output) if isinstance(force, str) and isinstance(output, str) else {}
     )
     given = {name: f', unit = "{units[name]}"' if name in units else "" for name in "xvmck"}
-
-    def change(document: Any) -> None:
-        for key in ("baseline", "lags", "physics", "motion", "suspects"):
-            document.pop(key, None)
-        document["motion"] = tomlkit.parse(
-            MOTION.format(output=outputs[0], force=inputs[0], **given)
-        )["motion"]
-        _make_table(document, ["learner"])["inputs"] = ["v"]
-
-    return edit_text(_without_comments(text, _OF_TERMS), change)
+    written = MOTION.format(output=outputs[0], force=inputs[0], **given)
+    return {("motion",): tomlkit.parse(written)["motion"], ("learner", "inputs"): ["v"]}
 
 
 def _without_comments(text: str, phrases: Sequence[str]) -> str:

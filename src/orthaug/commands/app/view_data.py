@@ -155,13 +155,18 @@ class DataView:
                         text(line, "li")
                 if self._apart:
                     self._offer_test(found)
-            elif not session.spec and (kept := spec_text.earlier()[:_OFFERED]):
-                text("Or continue with an earlier spec:", "p", "hint")
-                with ui.element("div").classes("fields"):
-                    for place in kept:
-                        when = datetime.fromtimestamp(place.stat().st_mtime)
-                        label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
-                        button(label, partial(session.open_spec, place, kept=True))
+            elif not session.spec:
+                self._offer_starts()
+
+    def _offer_starts(self) -> None:
+        """Offer the example, and earlier work."""
+        button("Try it with a mass, spring and damper", self.session.try_example)
+        if kept := spec_text.earlier()[:_OFFERED]:
+            text("Or continue with an earlier spec:", "p", "hint")
+        for place in kept:
+            when = datetime.fromtimestamp(place.stat().st_mtime)
+            label = f"{spec_text.kept_title(place)}, {when:%Y-%m-%d %H:%M}"
+            button(label, partial(self.session.open_spec, place, kept=True), classes="wide")
 
     def _offer_test(self, found: Mapping[str, Any]) -> None:
         """Offer to use a file that the spec does not name as a test."""
@@ -243,13 +248,10 @@ class DataView:
                 )
                 return
             if found["spec"] is None and not self._of_spec(found):
-                names = (
-                    "The names of the columns do not show which are inputs and outputs: choose "
-                    "them here."
-                )
-                note(found["open"] or names, "care")
+                note(found["open"] or _proposal(found), "care")
             with ui.element("div").classes("fields"):
-                step = "" if found["step"] is None else f"{found['step']:g}"
+                declared = spec_text.section(self.session.content(), "data").get("sampling_time")
+                step = spec_text.field_text(declared if found["step"] is None else found["step"])
                 label = "sampling time in s"
                 self.step_field = field(
                     label,
@@ -364,12 +366,17 @@ class DataView:
         prepared = {} if checked is None else checked["curves"]
         whole, raw = self._whole_file()
         cleaned = bool(checked and checked["prepared"])
+        step = spec_text.section(session.content(), "data").get("sampling_time")
+        step = step if isinstance(step, int | float) else 1.0
         rows = []
         shown = [curve["column"] for curve in prepared.values()] or list(raw)
         for name in shown:
-            drawn = (
-                [{**raw[name], "name": "as measured", "raw": bool(prepared)}] if name in raw else []
-            )
+            drawn = []
+            if name in raw:
+                x = raw[name]["x"]
+                if raw[name].get("untimed"):  # its sampling time stands in the spec alone
+                    x = [step * count for count in x]
+                drawn = [{**raw[name], "x": x, "name": "as measured", "raw": bool(prepared)}]
             unit = ""
             for channel, curve in prepared.items():
                 if curve["column"] == name:
@@ -408,6 +415,19 @@ class DataView:
                 text(f"Done: {done}", "p", "hint")
             if checked and session.spec:
                 table(("part", "rows"), list(checked["rows"].items()), "Rows that are used")
+
+
+def _proposal(found: Mapping[str, Any]) -> str:
+    """Return why columns are given a use before a person has chosen one."""
+    if found["guess"]:
+        why = f"Proposed, since {found['guess']}"
+    elif any(column["kind"] for column in found["columns"]):
+        why = "Proposed by the names of the columns"
+    else:
+        return (
+            "The names of the columns do not show which are inputs and outputs: choose them here."
+        )
+    return f"{why}. Confirm it with the button below, or choose otherwise."
 
 
 def _seconds(message: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -26,6 +27,8 @@ from orthaug.commands.app.widgets import (
 )
 
 _TERMS = ("baseline", "terms")
+_PHYSICS = {"terms": "a sum of terms", "motion": "equations of motion"}
+_MOTION = {"states": "States", "parameters": "Parameters"}
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
 _FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
 _MULTIPLE = 1e5  # % from which a change is given in words
@@ -43,6 +46,7 @@ class ModelView:
 
     def __init__(self, session: Session) -> None:
         self.session = session
+        self._wrong: dict[str, ui.element] = {}
 
     def draw(self) -> None:
         with ui.element("div").classes("columns wide-left"):
@@ -87,15 +91,18 @@ class ModelView:
             self._draw_physics({})
 
     def _draw_physics(self, content: Mapping[str, Any]) -> None:
+        self._wrong.clear()
         with redrawn(self.physics):
             if not content:
                 begin = self.session.first_step.removesuffix(".")
                 text(f"{begin}, or write a spec in the field below.", "p", "hint")
                 return
-            if "motion" in content:
+            source, kind = _source_of(content), spec_text.kind_of_physics(content)
+            if not source:
+                choice("written as", _PHYSICS, kind, self.session.choose_physics)
+            if kind == "motion":
                 self._draw_motion(content)
                 return
-            source = _source_of(content)
             if source:
                 where = f"{source.get('kind', 'source')} {source.get('file', '')}".strip()
                 words = f"Physics from a file ({where}), written in the spec below."
@@ -109,9 +116,7 @@ class ModelView:
             )
             for i, term in enumerate(spec_text.rows_of(self.session.spec, _TERMS)):
                 self._draw_term(i, term, several=len(outputs) > 1)
-            with ui.element("div").classes("fields"):
-                button("Add a term", self._add)
-                button("Write equations of motion instead", self._to_motion)
+            button("Add a term", self._add)
 
     def _draw_term(self, index: int, term: Mapping[str, Any], *, several: bool) -> None:
         keys = ("parameter", "regressor", *(("output",) if several else ()), "initial", "unit")
@@ -139,31 +144,98 @@ class ModelView:
         row |= {"output": outputs[0]} if len(outputs) > 1 else {}
         self.session.edit("more terms", spec_text.with_row, _TERMS, row)
 
-    def _to_motion(self) -> None:
-        self.session.edit("motion", spec_text.as_motion)
-        ui.notify("A mass, a spring and a damper: change the equations in the spec below.")
-
     def _draw_motion(self, content: Mapping[str, Any]) -> None:
         motion = spec_text.section(content, "motion")
-        text("Equations of motion. States and outputs are written in the spec below.", "p", "hint")
-        for name, state in spec_text.section(motion, "states").items():
-            equation = state.get("derivative") if isinstance(state, Mapping) else None
-            learned = " + learned" if isinstance(state, Mapping) and state.get("learned") else ""
-            text(f"d{name}/dt = {equation}{learned}", "p", "formula")
-        for name, row in spec_text.section(motion, "parameters").items():
-            if isinstance(row, Mapping):
-                with label_widget(
-                    ui.element("div").classes("entry term").props("role=group"), f"parameter {name}"
-                ):
-                    text(name, "p", "strong name")
-                    with ui.element("div").classes("fields grow"):
-                        for key in ("initial", "unit", "min", "max"):
-                            field(
-                                key,
-                                row.get(key),
-                                self._value("motion", "parameters", name, key),
-                                classes="short",
-                            )
+        equation = "next" if motion.get("integrator") == "discrete" else "derivative"
+        keys = {
+            "states": (equation, "start", "unit"),
+            "parameters": ("initial", "unit", "min", "max"),
+        }
+        for part, own in keys.items():
+            text(_MOTION[part], "h3")
+            for name, row in spec_text.section(motion, part).items():
+                if isinstance(row, Mapping):
+                    self._draw_quantity(("motion", part, name), row, own)
+            button(f"Add a {part[:-1]}", partial(self._add_quantity, part, own[0]))
+        text("Outputs", "h3")
+        with ui.element("div").classes("fields"):
+            for name, value in spec_text.section(motion, "outputs").items():
+                if not isinstance(value, Mapping):
+                    field(f"{name} =", value, self._value("motion", "outputs", name))
+        self._wrong["outputs"] = ui.element("div")
+        text("Start values", "h3")
+        with ui.element("div").classes("fields"):
+            self.starts = button("Estimate from the data", self.session.estimate_starts)
+            self.starting = ui.element("div").classes("grow")
+        self.follow_work()
+
+    def _draw_quantity(
+        self, path: Sequence[str], row: Mapping[str, Any], keys: Sequence[str]
+    ) -> None:
+        """Draw a state or a parameter, with what is wrong with it below."""
+        kind, name = path[1][:-1], path[2]
+        with label_widget(
+            ui.element("div").classes("entry term").props("role=group"), f"{kind} {name}"
+        ):
+            with ui.element("div").classes("fields grow"):
+                field(
+                    "name",
+                    name,
+                    lambda new: self.session.edit("more terms", spec_text.with_name, path, new),
+                    classes="short",
+                )
+                for key in keys:
+                    label = f"d{name}/dt" if key == "derivative" else key
+                    wide = {"derivative": "regressor", "next": "regressor", "start": "medium"}
+                    field(
+                        label, row.get(key), self._value(*path, key), classes=wide.get(key, "short")
+                    )
+                if kind == "state":
+                    made = ui.checkbox("learner added", value=bool(row.get("learned")))
+                    made.on_value_change(partial(self._set_learned, path))
+                    label_widget(made, "learner added")
+                self._wrong[name] = ui.element("div").classes("grow")
+            remove = partial(self.session.edit, "more terms", spec_text.with_value, path, None)
+            label_widget(button("Remove", remove), f"Remove {kind} {name}")
+
+    def _set_learned(self, path: Sequence[str], event: Any) -> None:
+        self.session.edit(
+            "form", spec_text.with_value, (*path, "learned"), True if event.value else None
+        )
+
+    def _add_quantity(self, part: str, key: str) -> None:
+        taken = spec_text.section(self.session.content(), "motion", part)
+        name = next(name for i in range(1, 1000) if (name := f"{part[0]}{i}") not in taken)
+        row = {key: 1.0 if part == "parameters" else "0"}
+        self.session.edit("more terms", spec_text.with_value, ("motion", part, name), row)
+
+    def follow_work(self) -> None:
+        """Show how the estimation of start values goes."""
+        session = self.session
+        if "motion" not in session.content() or self.starting.is_deleted:
+            return
+        self.starts.set_enabled(session.starting is None)
+        with redrawn(self.starting):
+            if session.starting is not None:
+                took = time.monotonic() - session.starting
+                note(f"Fitting the physics alone to short segments · {took:.0f} s", "busy")
+            elif session.start_trouble:
+                note(sentence(session.start_trouble), "bad")
+            else:
+                hint = "The physics alone is fitted to segments that lengthen; Undo takes it back."
+                text(hint, "p", "hint")
+
+    def _show_wrong(self) -> None:
+        """Show under a state, parameter or output what the check refuses about it."""
+        session = self.session
+        why = session.refused if not session.checking and "motion: " in session.refused else ""
+        for name, place in self._wrong.items():
+            if place.is_deleted:
+                continue
+            own = f"'{name}'" in why if name != "outputs" else "the output" in why
+            with redrawn(place):
+                if own:
+                    text(sentence(why.partition("motion: ")[2]), "p", "wrong")
 
     def _value(self, *path: str) -> Callable[[str], None]:
         """Return a callback that stores the value of a field under a key."""
@@ -241,6 +313,7 @@ class ModelView:
     def follow_check(self) -> None:
         """Show the result of checking the present spec."""
         session = self.session
+        self._show_wrong()
         with redrawn(self.check):
             if not session.spec.strip():
                 text(

@@ -58,9 +58,7 @@ class ReportView:
         session = self.session
         kinds = {"fit": "report.html", "compare": "comparison.html"}
         marks = {
-            name: session.commands[kind].began
-            for kind, name in kinds.items()
-            if kind in session.results
+            name: session.shown[kind] for kind, name in kinds.items() if kind in session.results
         }
         there = list(marks)
         if marks == self._state:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from html import escape
 from typing import Any
 
 from nicegui import ui
 
+from orthaug._base.progress import Stage
+from orthaug.commands.app.kept_results import KeptResult
 from orthaug.commands.app.processes import Command, Run
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.spec_text import names, section
 from orthaug.commands.app.widgets import (
     button,
     card,
+    curves_figure,
+    interval_figure,
+    label_widget,
     loss_figure,
     note,
     number,
@@ -21,12 +28,14 @@ from orthaug.commands.app.widgets import (
     plot,
     redrawn,
     run_name,
+    sentence,
     table,
     text,
 )
 
 _MOST = 1500  # points of a curve of the loss
 _LEAST = 8  # points that are worth a curve
+_KEPT_HINT = "They are kept when the server ends. Open shows one again, with its spec."
 _TITLES = {"fit": "Training", "compare": "Comparison"}
 
 
@@ -38,6 +47,10 @@ class TrainingView:
         self._told = 0  # losses that are drawn
         self._curve: ui.plotly | None = None
         self._state: Any = None
+        self._models: list[int] = []
+        self._listed: Any = None
+        self._pair: Any = None
+        self._boxes: dict[int, ui.checkbox] = {}
 
     def draw(self) -> None:
         with card(
@@ -53,8 +66,13 @@ class TrainingView:
             self.bar = ui.element("progress").props(
                 'max=1 value=0 aria-label="progress of training"'
             )
-            self.losses = ui.element("div")
+            with ui.element("div").classes("columns beside"):
+                self.losses = ui.element("div")
+                self.so_far = ui.element("div")
         self.results = ui.element("div")
+        with card("Results of this spec", _KEPT_HINT) as self.history:
+            self.kept = ui.element("div")
+            self.compared = ui.element("div")
         self.follow_work()
 
     def follow_check(self) -> None:
@@ -92,11 +110,34 @@ class TrainingView:
                 self._tell(shown)
         self.bar.set_visibility(running is not None)
         self._draw_losses([] if shown is None else shown.losses)
-        trained = [session.trained.get(kind) for kind in _TITLES]
-        state = (running is None, *trained, session.spec, session.units, *session.verdicts.values())
+        self._draw_so_far({} if running is None else running.models)
+        state = (running is None, session.spec, session.units, dict(session.shown))
+        state += (list(session.verdicts), [session.curves.get(kind) for kind in _TITLES])
         if state != self._state:
             self._state = state
             self._draw_results()
+        self.history.set_visibility(bool(session.kept))
+        listed = (running is None, session.kept, dict(session.shown), session.spec)
+        if listed != self._listed:
+            self._listed = listed
+            self._list_results()
+        self._follow_pair()
+
+    def _follow_pair(self) -> None:
+        """Show the two results that are compared."""
+        session, pair = self.session, self.session.pair
+        chosen = {one.number for one in pair}
+        for own, box in self._boxes.items():
+            box.set_value(own in chosen)
+        state = (pair, session.curves.get("pair"))
+        if state == self._pair:
+            return
+        self._pair = state
+        with redrawn(self.compared):
+            if len(pair) == 2:
+                _draw_pair(pair, session.curves.get("pair"))
+            elif pair:
+                text(f"Choose another one to compare with {pair[0].name}.", "p", "hint")
 
     def _draw_losses(self, losses: Sequence[tuple[Run, int, float | None]]) -> None:
         losses = losses if len(losses) >= _LEAST else []
@@ -114,6 +155,27 @@ class TrainingView:
             self.caption.set_content(escape(_runs_caption({run for run, _, _ in losses})))
         self._told = len(losses)
 
+    def _draw_so_far(self, models: Mapping[str, Mapping[str, Any]]) -> None:
+        """Draw what was measured, and the free run of physics alone and of the best run so far."""
+        state = [id(model) for model in models.values()]
+        if state == self._models:
+            return
+        self._models = state
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for i, (name, model) in enumerate(models.items(), 1):
+            for output, own in model["outputs"].items():
+                label = f"{output} [{own['unit']}]" if own["unit"] else output
+                first = {"name": "measured", "y": own["measured"], "raw": True, "entry": 0}
+                row = rows.setdefault(label, [{**first, "x": model["time"]}])
+                row.append({"name": name, "x": model["time"], "y": own["model"], "entry": i})
+        with redrawn(self.so_far):
+            if rows:
+                label = "Free run on the training data, so far."
+                plot(curves_figure(list(rows.items())), label)
+                text(
+                    f"{label[:-1]}: its first rows, with the best run that has ended.", "p", "hint"
+                )
+
     def _tell(self, command: Command) -> None:
         progress, what = command.progress, _TITLES.get(command.arguments[0], "")
         took = f"{command.seconds:.0f} s"
@@ -127,10 +189,17 @@ class TrainingView:
                     f"{progress['iteration']}"
                 )
                 now += f", loss {number(progress['loss'], 4)}"
+            done = progress.get("done", 0)
+            if command.stage is not None:
+                step, steps = list(Stage).index(command.stage) + 1, len(Stage)
+                now, done = (
+                    f"after the runs, {step} of {steps}: {command.stage.value}",
+                    step / steps,
+                )
             if command.stopping or command.ending:
                 now = "stopping …" if command.stopping else "ending with the best so far …"
             note(f"{what}: {now} · {took}", "busy")
-            self.bar.props(f"value={progress.get('done', 0)}")
+            self.bar.props(f"value={done}")
         elif command.stopping and command.code != 0:
             note(f"{what} was stopped after {took}; nothing was kept of it.", "care")
         elif command.code == 0 and command.ending:
@@ -158,7 +227,95 @@ class TrainingView:
                         verdict := session.verdicts.get(kind)
                     ) is not None:  # that the report begins with
                         note(" ".join(verdict["sentences"]), verdict["level"])
+                    _runs(session.curves.get(kind))
                     draw(result, session.units if same else {})
+
+    def _list_results(self) -> None:
+        session, shown = self.session, set(self.session.shown.items())
+        fits = sum(kept.kind == "fit" for kept in session.kept)
+        self._boxes.clear()
+        with redrawn(self.kept):
+            for kept in reversed(session.kept):
+                with label_widget(
+                    ui.element("div").classes("entry").props("role=group"), kept.name
+                ):
+                    with ui.element("div").classes("grow"):
+                        what = "" if kept.kind == "fit" else " (comparison)"
+                        text(f"{kept.number}. {kept.score}{what}", "p", "strong")
+                        text(f"{kept.made:%Y-%m-%d %H:%M} · {kept.change}", "p", "hint")
+                    if kept.kind == "fit" and fits > 1:
+                        box = self._boxes[kept.number] = ui.checkbox("compare")
+                        box.on_value_change(partial(self._choose, kept))
+                        label_widget(box, f"compare {kept.name}")
+                    made = button("Open", partial(session.show_result, kept, with_spec=True))
+                    label_widget(made, f"Open {kept.name}")
+                    same = (kept.kind, kept.number) in shown and kept.spec == session.spec
+                    made.set_enabled(session.running is None and not same)
+
+    def _choose(self, kept: KeptResult, event: Any) -> None:
+        self.session.choose_pair(kept, bool(event.value))
+
+
+def _runs(found: Mapping[str, Any] | None) -> None:
+    """Draw measured outputs and free runs."""
+    if found is None:
+        note("Simulating the free runs …", "busy")
+        return
+    if "refused" in found:
+        note(f"The free runs are not drawn: {found['refused']}", "care")
+        return
+    for part in dict.fromkeys(row["part"] for row in found["rows"]):
+        rows = []
+        for row in (row for row in found["rows"] if row["part"] == part):
+            measured, *models = row["curves"]
+            first = {**measured, "raw": True, "entry": 0}
+            runs = [{**model, "entry": i} for i, model in enumerate(models)]
+            rows.append((row["label"], [first, *reversed(runs)]))
+            rows.append(("error", [_less(measured, run) for run in reversed(runs)]))
+        names = _listed([model["name"] for model in models])
+        text(f"Free run on {part}", "h3")
+        plot(curves_figure(rows), f"Free run of {names} on {part}, measured, and the error.")
+        text(
+            f"The {len(measured['x'])} rows where {models[0]['name']} errs most; the error is what "
+            "was measured less the free run. Drag to zoom.",
+            "p",
+            "hint",
+        )
+
+
+def _less(measured: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the curve of measured less model."""
+    pairs = zip(measured["y"], run["y"], strict=True)
+    return {**run, "y": [None if a is None or b is None else a - b for a, b in pairs]}
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(", ".join(names).rsplit(", ", 1))
+
+
+def _draw_pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
+    """Draw two results beside each other."""
+    read = [json.loads((one.folder / "result.json").read_text(encoding="utf-8")) for one in pair]
+    models = [(one.name, result["parameters"]) for one, result in zip(pair, read, strict=True)]
+    text(f"{sentence(pair[0].name)} and {pair[1].name}", "h3")
+    _interval_plot(models, {})
+    _runs(curves)
+    _scores(
+        [(one.name, result["scores"]) for one, result in zip(pair, read, strict=True)],
+        "",
+        "Scores of both",
+    )
+    _parameters("Parameters of both", models, {})
+
+
+def _interval_plot(
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], given: Mapping[str, str]
+) -> None:
+    units = {row["name"]: row["unit"] for _, rows in models for row in rows if row["unit"]}
+    units |= given
+    if any(rows for _, rows in models):
+        names = ", ".join(name for name, _ in models)
+        plot(interval_figure(models, units), f"Parameters with 95 % intervals of {names}.")
 
 
 def _runs_caption(runs: set[Run]) -> str:
@@ -220,7 +377,9 @@ def _output_units(result: Mapping[str, Any]) -> str:
     return f" [{', '.join(units)}]" if set(units) - {"–"} else ""
 
 
-def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
+def _scores(
+    models: Sequence[tuple[str, Mapping[str, Any]]], unit: str, caption: str = "Scores"
+) -> None:
     rows = []
     for name, scores in models:
         for part, kinds in scores.items():
@@ -233,7 +392,7 @@ def _scores(models: Sequence[tuple[str, Mapping[str, Any]]], unit: str) -> None:
             ]
             rows.append((name or part, *([part] if name else []), *own))
     head = (*(("model", "part") if models and models[0][0] else ("part",)), "NRMSE, one step")
-    table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, "Scores")
+    table((*head, "NRMSE, free run", f"RMSE, free run{unit}", "FIT %, free run"), rows, caption)
 
 
 def _numbers(values: Sequence[float | None] | None, digits: int = 4) -> str:
@@ -244,8 +403,12 @@ def _compare(result: Mapping[str, Any], units: Mapping[str, str]) -> None:
     if result["chosen"]:
         text(f"Chosen on the validation part: {result['chosen']}.", "p", "strong")
     models = result["comparison"]
-    _scores([(row["name"], row["scores"]) for row in models], _output_units(result))
-    _parameters("Parameters", [(row["name"], row["parameters"]) for row in models], units)
+    _interval_plot([(row["name"], row["parameters"]) for row in models], units)
+    scores = [(row["name"], row["scores"]) for row in models]
+    _scores(scores, _output_units(result), "Scores of every model")
+    _parameters(
+        "Parameters of every model", [(row["name"], row["parameters"]) for row in models], units
+    )
     weights = [f"{row['name']} {row['weights']}" for row in models]
     text(f"Weights of the learner: {', '.join(weights)}.", "p", "hint")
     for row in models:

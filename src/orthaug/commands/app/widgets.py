@@ -29,12 +29,13 @@ def label_widget(element: Drawn, label: str) -> Drawn:
 
 def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
     """Return an element with text that is never read as HTML."""
-    return ui.html(_unbreakable_lags(what), sanitize=False, tag=tag).classes(classes)
+    return ui.html(marked(what), sanitize=False, tag=tag).classes(classes)
 
 
-def _unbreakable_lags(what: Any) -> str:
-    """Return escaped text in which no line breaks at the minus of a lag."""
-    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", escape(str(what)))
+def marked(what: Any) -> str:
+    """Return escaped text: `names` as code, and no line breaks at the minus of a lag."""
+    lines = re.sub(r"`([^`\n]+)`", r"<code>\1</code>", escape(str(what)))
+    return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", lines)
 
 
 def sentence(message: str) -> str:
@@ -45,8 +46,6 @@ def sentence(message: str) -> str:
 def card(title: str, hint: str = "", classes: str = "") -> ui.element:
     """Return a section with a heading."""
     section = ui.element("section").classes(f"card {classes}")
-    if "sticky" in classes:  # it scrolls by itself, by keys too
-        label_widget(section.props("tabindex=0 role=region"), title)
     with section:
         text(title, "h2")
         if hint:
@@ -79,7 +78,7 @@ def field(
 
 def refuse(made: ui.input, why: str) -> None:
     """Show an error under a field."""
-    made.props["error"], made.props["error-message"] = bool(why), why
+    made.props["error"], made.props["error-message"] = bool(why), why.replace("`", "")
     made.update()
 
 
@@ -120,12 +119,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
     ]
     lines.append("</tr></thead><tbody>")
     for row in rows:
-        lines.append(f"<tr><th scope='row'>{_unbreakable_lags(row[0])}</th>")
+        lines.append(f"<tr><th scope='row'>{marked(row[0])}</th>")
         for name, value, kind in zip(head[1:], map(str, row[1:]), kinds[1:], strict=True):
             kind += " n" if len(value) <= _SHORT else ""
             lines.append(
-                f"<td class='{kind}' data-label='{escape(name, True)}'>"
-                f"{_unbreakable_lags(value)}</td>"
+                f"<td class='{kind}' data-label='{escape(name, True)}'>{marked(value)}</td>"
             )
         lines.append("</tr>")
     made = ui.html("".join([*lines, "</tbody></table>"]), sanitize=False).classes("table")
@@ -163,6 +161,7 @@ def note(what: str, kind: str = "") -> ui.html:
 
 _MOST_ENTRIES = 8  # of a legend
 _ENTRY = 19  # px of one
+_AXIS = 58  # px of an axis with its title
 _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
@@ -171,9 +170,11 @@ def curves_figure(
 ) -> dict[str, Any]:
     """Return a figure of curves below one another on a common time axis.
 
-    Each row has a label, and traces with `x`, `y`, `name` and `raw`.
+    Each row has a label, and traces with `x`, `y`, `name` and `raw`; where they have an `entry`,
+    each name has one in the legend, and the color of that number.
     """
     traces: list[dict[str, Any]] = []
+    named = set[str]()
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {
         "title": _compact_layout(unit),
@@ -191,8 +192,12 @@ def curves_figure(
             **{"title": _compact_layout(label), "nticks": 5, "anchor": "x"},
         }
         for curve in drawn:
-            raw = curve.get("raw", False)
-            line = {"width": 1.2, "color": "#8b949e" if raw else _COLORS[i % len(_COLORS)]}
+            raw, entry = curve.get("raw", False), curve.get("entry")
+            color = _COLORS[(i if entry is None else entry) % len(_COLORS)]
+            line = {
+                "width": 2.4 if raw and entry is not None else 1.2,
+                "color": "#8b949e" if raw else color,
+            }
             own = {
                 "name": curve["name"],
                 "x": curve["x"],
@@ -207,7 +212,63 @@ def curves_figure(
                     "mode": "lines",
                     "xaxis": "x",
                     "yaxis": axis,
-                    "showlegend": False,
+                    "legendgroup": curve["name"],
+                    "showlegend": entry is not None and curve["name"] not in named,
+                }
+            )
+            named.add(curve["name"])
+    if any(trace["showlegend"] for trace in traces):
+        layout["margin"]["t"] += _ENTRY + 8
+        layout["legend"] = {
+            "orientation": "h",
+            "yref": "container",
+            "y": 1,
+            "yanchor": "top",
+            "x": 0,
+        }
+    return {"data": traces, "layout": layout, "config": _CONFIG}
+
+
+def interval_figure(
+    models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return a figure of each parameter in every model, with its 95 % interval."""
+    names = list(dict.fromkeys(row["name"] for _, rows in models for row in rows))
+    one = 22 * len(models) + 8  # px of the dots of a parameter, with its axis below
+    whole = (one + _AXIS) * len(names)
+    layout, traces = _layout(whole + 16), list[dict[str, Any]]()
+    layout |= {"hovermode": "closest", "showlegend": False}
+    layout["margin"] |= {"t": 8, "b": 8}
+    for i, name in enumerate(names):
+        axis, top = (str(i + 1) if i else ""), 1 - i * (one + _AXIS) / whole
+        title = f"{name} [{units[name]}]" if units.get(name, "1") != "1" else name
+        layout[f"xaxis{axis}"] = {
+            **{"zeroline": False, "nticks": 5, "anchor": f"y{axis}"},
+            "title": _compact_layout(escape(title)) | {"standoff": 4},
+        }
+        layout[f"yaxis{axis}"] = {
+            **{"type": "category", "automargin": True, "anchor": f"x{axis}"},
+            **{"domain": [max(0.0, top - one / whole), top]},
+            **{"range": [len(models) - 0.4, -0.6]},
+            **{"categoryorder": "array", "categoryarray": [escape(own) for own, _ in models]},
+        }
+        for j, (model, rows) in enumerate(models):
+            row = next((row for row in rows if row["name"] == name), None)
+            if row is None or row["value"] is None:
+                continue
+            low, high = row["ci95"] or (None, None)
+            bar = [0.0 if end is None else abs(end - row["value"]) for end in (high, low)]
+            color = _COLORS[j % len(_COLORS)]
+            traces.append(
+                {
+                    **{"type": "scatter", "mode": "markers", "name": escape(model)},
+                    **{"x": [row["value"]], "y": [escape(model)]},
+                    **{"xaxis": f"x{axis}", "yaxis": f"y{axis}"},
+                    "marker": {"size": 8, "color": color},
+                    "error_x": {
+                        **{"type": "data", "symmetric": False, "color": color, "thickness": 2},
+                        **{"array": bar[:1], "arrayminus": bar[1:]},
+                    },
                 }
             )
     return {"data": traces, "layout": layout, "config": _CONFIG}

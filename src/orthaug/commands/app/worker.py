@@ -11,25 +11,32 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.commands import init as starting
-from orthaug.commands.job import Job
+from orthaug.commands.app.spec_text import with_value
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.job_result import check as check_job
 from orthaug.commands.opening import open_job
 from orthaug.data.columns import Column
 from orthaug.data.record import Channel, check_step
 from orthaug.data.survey import Survey
 
+if TYPE_CHECKING:
+    from orthaug.models.response import Response
+
 MOST = 3000
 """Points of a curve that are drawn."""
 _KEPT = 600e6  # bytes that a process may have held to go on
+_PARTS, _STRETCH = 4, 300  # parts of the data, and rows of each, whose free runs are drawn
+_SEGMENTS, _START_ROWS, _START_ITERATIONS = (10, 80), 600, 40  # of start values
 _DRAWN = 12  # columns of a file whose curves are
 
 
@@ -109,17 +116,20 @@ def look(
         "spec": None,
         "account": "",
         "open": "",
+        "guess": "",
     }
     try:
         given = None if step is None else check_step(step)
-        roles = starting.assign(found, inputs, outputs, given, guess=False)  # the page asks
+        roles = starting.assign(found, inputs, outputs, given)
         if roles is not None:
-            draft = starting.draft(found, roles, Path(out))
-            names = {
+            answer |= {
                 "inputs": [c.header for c in roles.inputs],
                 "outputs": [c.header for c in roles.outputs],
+                "guess": roles.reason,  # which a person is to confirm before there is a spec
             }
-            answer |= {"spec": draft.spec, "account": draft.account, **names}
+        if roles is not None and not roles.reason:
+            draft = starting.draft(found, roles, Path(out))
+            answer |= {"spec": draft.spec, "account": draft.account}
     except InputError as error:
         answer["open"] = str(error).removeprefix(f"{path}: ")
     return answer | {"curves": _curves(found)}
@@ -146,7 +156,7 @@ def _column(found: Survey, column: Column) -> dict[str, Any]:
     head = column.name + (f" = column '{column.header}'" if column.header != column.name else "")
     own = {
         "header": column.header,
-        "kind": column.kind,
+        "kind": column.proposed,
         "usable": usable,
         "timed": column is found.clock.column,
     }
@@ -159,9 +169,12 @@ def _curves(found: Survey) -> dict[str, Any]:
     for column in found.signals[:_DRAWN]:
         values = column.values[: column.filled]
         time = found.clock.seconds[: len(values)] if found.clock.seconds is not None else None
-        if time is None or len(time) < len(values) or not np.isfinite(time).all():
+        untimed = time is None or len(time) < len(values) or not np.isfinite(time).all()
+        if untimed:
             time = step * np.arange(len(values))
-        curves[column.header] = thin_curve(time, values)
+        assert time is not None
+        untimed = untimed and found.clock.step is None
+        curves[column.header] = {**thin_curve(time, values), "untimed": untimed}
     return curves
 
 
@@ -198,6 +211,15 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     }
 
 
+def example(folder: str) -> dict[str, Any]:
+    """Write the records of the built-in example into a folder; return its spec."""
+    from orthaug.commands import demo
+    from orthaug.studies.synthetic import mass_spring_damper
+
+    demo.write_records(mass_spring_damper(), Path(folder))
+    return {"spec": demo.SPEC}
+
+
 def verdict(path: str, kind: str) -> dict[str, Any]:
     """Return the verdict that the report of a result begins with: `level`, and three `sentences`.
 
@@ -213,6 +235,79 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
     else:
         found = compare_verdict(CompareResult.from_json(text))
     return {"level": found.level, "sentences": found.sentences}
+
+
+def starts(path: str) -> dict[str, Any]:
+    """Return initial values for the parameters of a motion, by name.
+
+    The physics alone is fitted to the first rows in segments that lengthen: short ones find
+    parameters that are far from where they begin.
+    """
+    from orthaug._base.jax import use_compilation_cache
+    from orthaug.fitting.criteria import Simulation
+
+    use_compilation_cache()
+    place = Path(path)
+    spec = with_value(place.read_text("utf-8"), ("training", "iterations"), _START_ITERATIONS)
+    values: dict[str, float] = {}
+    for segment in _SEGMENTS:
+        place.write_text(spec, encoding="utf-8")
+        job = open_job(place, require_full_rank=False)
+        longest = max(job.train.record.experiments, key=len)
+        record = replace(job.train.record, experiments=(longest,)).rows(0, _START_ROWS)
+        fit = replace(job, problem=job.problem.on(record)).run(
+            Variant(PHYSICS_ONLY, criterion=Simulation(min(segment, len(record) - 1), 0))
+        )
+        for name, value in zip(fit.problem.names, fit.values, strict=True):
+            if np.isfinite(value):
+                values[name] = float(f"{value:.6g}")
+                path_of = ("motion", "parameters", name, "initial")
+                spec = with_value(spec, path_of, values[name])
+    return {"values": values}
+
+
+def free_runs(path: str, models: dict[str, str]) -> dict[str, Any]:
+    """Return measured outputs and the free runs of saved models, by part and output of a spec.
+
+    Of each part it is the stretch on which the first model errs most.
+    """
+    from orthaug.models.storage import load
+
+    job, loaded = open_job(Path(path), require_full_rank=False), []
+    for name, folder in models.items():
+        loaded.append((name, load(Path(folder))))
+    rows = []
+    for part in job.parts[:_PARTS]:
+        ran = {name: model.simulate(part.record) for name, model in loaded}
+        rows += _stretch(part.name, ran)
+    return {"rows": rows}
+
+
+def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, Any]]:
+    """Return for each output the curves of the worst stretch of one experiment."""
+    from orthaug.reports.page_runs import worst_window
+
+    first = next(iter(ran.values()))
+    errors = [np.square(np.nan_to_num(t.errors)).sum() for t in first.trajectories]
+    worst = int(np.argmax(np.nan_to_num(errors)))
+    measured, model = first.trajectories[worst].measured, first.trajectories[worst].model
+    assert measured is not None
+    begin = worst_window(measured, model, _STRETCH) if len(model) > _STRETCH else 0
+    own = slice(begin, begin + _STRETCH)
+    time = first.trajectories[worst].time(first.sampling_time)[own]
+    known = {"measured": measured}
+    known |= {name: response.trajectories[worst].model for name, response in ran.items()}
+    return [
+        {
+            "label": f"{channel.name} [{channel.unit}]" if channel.unit else channel.name,
+            "part": part,
+            "curves": [
+                {"name": name, "x": _plain(time), "y": _plain(values[own, j])}
+                for name, values in known.items()
+            ],
+        }
+        for j, channel in enumerate(first.outputs)
+    ]
 
 
 def _units(job: Job) -> list[tuple[str, str, str | None]]:
@@ -276,6 +371,9 @@ def _plain(values: Vector) -> list[float | None]:
 QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "look": look,
     "examine": examine,
+    "example": example,
+    "free_runs": free_runs,
+    "starts": starts,
     "verdict": verdict,
 }
 
