@@ -28,18 +28,27 @@ from orthaug._base.errors import PrecisionError
 from orthaug._base.memory import return_free_memory
 
 if TYPE_CHECKING:
+    from types import ModuleType as ArrayModule
+
     import jax
     import jax.numpy as jnp
+    import numpy as np
     from jax import Array
+
+    AnyArray = np.ndarray | Array
 else:
     # In annotations; at run time jaxtyping checks shape and type of whatever is an array
     Array = Any
+    AnyArray = Any  # of NumPy or JAX
+    ArrayModule = Any  # NumPy, or JAX's
 
 _LENGTH = hashlib.sha256().digest_size
 _MAPS = 65_530  # of memory, that Linux grants a process unless it is told otherwise
 _MOST_MAPS = 0.5  # of these, up to which programs stay: one fit with its diagnosis takes 0.1
 __all__ = [
+    "AnyArray",
     "Array",
+    "ArrayModule",
     "is_traced",
     "jax",
     "jnp",

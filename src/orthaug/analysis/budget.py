@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import percent, plain_number
+from orthaug._base.lines import first_words, percent, plain_number
 from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
 from orthaug.analysis.bias_hull import (
     LEAST,
@@ -582,9 +582,8 @@ def _describe_cause(entry: SuspectedBias) -> str:
 
 def list_biases(large: Sequence[ParameterBias]) -> str:
     """Return the largest biases in words."""
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_LISTED]
-    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
-    return f"{', '.join(map(_describe_bias, shown))}{more}"
+    ordered = sorted(large, key=lambda entry: -(entry.errors or 0.0))
+    return first_words(list(map(_describe_bias, ordered)), _LISTED)
 
 
 def _describe_bias(entry: ParameterBias) -> str:

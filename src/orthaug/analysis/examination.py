@@ -77,7 +77,7 @@ def examine(fit: Any, evidence: Evidence) -> Examination:
 
 def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
     """Return a fit scored on every part, with the findings on it but verdict and doubts."""
-    warnings: list[Any] = [*evidence.warnings, *fit.warnings]
+    warnings: list[Warning] = [*evidence.warnings, *fit.warnings]
     scores, responses = {}, {}
     if fit.status.ok:
         for part in evidence.parts:
@@ -117,7 +117,7 @@ def _analyse(
     fit: Any,
     evidence: Evidence,
     responses: Mapping[str, tuple[Response, Response]],
-    warnings: list[Any],
+    warnings: list[Warning],
 ) -> tuple[Any, dict[str, Any]]:
     """Return the fit with its standard errors, and the findings of its analyses.
 
@@ -192,7 +192,7 @@ def _with_biases(
     ]
 
 
-def _of_learner(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict[str, Any]:
+def _of_learner(fit: Any, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
     """Return intervals over experiments, and the equations of a learner of terms."""
     over = attempt(
         "the errors over experiments",
@@ -244,7 +244,9 @@ def _unexplained_warnings(fitted: Examination, physics: Callable[[], Any] | None
     return [Warning("unexplained", text)]
 
 
-def _over_experiments(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict[str, Any] | None:
+def _over_experiments(
+    fit: Any, evidence: Evidence, warnings: list[Warning]
+) -> dict[str, Any] | None:
     """Return intervals for experiments like those fitted; None where these are too few.
 
     A warning is added where they differ by more than the fit's own intervals allow.
@@ -275,7 +277,7 @@ def _over_experiments(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict
     return content
 
 
-def _status(fit: Any, warnings: Sequence[Any]) -> Any:
+def _status(fit: Any, warnings: Sequence[Warning]) -> Any:
     """Return how training ended.
 
     For a model whose free run diverges, the message begins with that.
@@ -323,7 +325,7 @@ def _one_step_only(
     return [Warning("one_step_only", text)]
 
 
-def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
+def _for_observers(fit: Any, verdict: str, warnings: list[Warning]) -> Any:
     """Return the fit with a model that keeps what observers need.
 
     These are the verdict on the residual, and the two noises.
@@ -343,7 +345,7 @@ def with_verdict(made: E) -> E:
     learns = fit.learns
     if not fit.status.ok or not (learns or fit.held_out is not None):
         return made
-    failed: list[Any] = []
+    failed: list[Warning] = []
     physics = cache(partial(_physics_alone, fit))
     verdict = attempt(
         "the judgement of the learner",

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice
+from orthaug._base.checks import Vector, positive
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.visited import (
     MOST_STEPS,
     RunPoint,
     RunPoints,
-    positive,
     sample_free_run,
-    sample_measured,
 )
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -118,33 +116,25 @@ class Feedback:
     diverged: tuple[str, ...]
 
 
-def feedback(
-    model: Model, record: Record, *, along: str = "simulation", response: Response | None = None
-) -> Feedback | None:
-    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None without a state.
+def feedback(model: Model, record: Record, *, response: Response | None = None) -> Feedback | None:
+    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along the free run.
 
-    At most 20000 steps, spread evenly: fewer where the state is large, none where n0 is above 200.
+    None without a state. At most 20000 steps up to where it diverges, spread evenly: fewer where
+    the state is large, none where n0 is above 200.
     Radii below 1 do not make a nonlinear run stable, nor do some above 1 make it unstable. They say
     where to look.
 
     Args:
-        along: "simulation", states of the free run up to where it diverges, or "measured", as the
-            outputs give them.
         response: the model's free run of the record, if it is there already.
 
     Raises:
-        InputError: a record that does not fit the model, or another `along`.
+        InputError: a record that does not fit the model.
     """
-    check_choice(along, ("simulation", "measured"), "`along`")
     if not (size := model.form.states):
         return None
     most = 0 if size > _LONGEST_STATE else min(MOST_STEPS, int(MOST_WORK / size**3))
-    if along == "simulation":
-        run = sample_free_run(
-            model, record, model.simulate(record) if response is None else response, most
-        )
-    else:
-        run = sample_measured(model, record, most)
+    response = model.simulate(record) if response is None else response
+    run = sample_free_run(model, record, response, most)
     points, transition, radius = linearise_points(model, run.points)
     largest, worst = points.worst(record, radius, model.form.describe)
     median, share = (

@@ -373,7 +373,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit
-    c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
+    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
     place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
     if fit.learns:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, positive
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.feedback import by_differences
 from orthaug.models.dynamics import Numbers
@@ -191,8 +191,7 @@ def step_of(model: Model) -> Step:
 
 def sizes_of(model: Model) -> Vector:
     """Return the sizes of the unknowns of rest over the training data."""
-    size = step_of(model).sizes(model)
-    return np.where(np.isfinite(size) & (size > 0), size, 1.0)
+    return positive(step_of(model).sizes(model))
 
 
 @partial(quick_jit, static_argnames="step")

@@ -206,8 +206,7 @@ def _view(
         grid = _grid(poles, model.sampling_time) if frequency is None else frequency
         bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
         warnings += _rough(bode)
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-    units |= step.units
+    units = model.units | step.units
     outputs = tuple(channel.name for channel in model.outputs)
     modes = sampled.modes.at_zero
     seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)

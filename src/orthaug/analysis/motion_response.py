@@ -284,7 +284,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         or 2 * substeps > MOST_SUBSTEPS
     ):
         return None
-    c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
+    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
     finer = segmented.with_substeps(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
     moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add

@@ -16,7 +16,7 @@ from orthaug.models.response import Response
 
 
 def score_part(
-    model: Any, part: Part, warnings: list[Any]
+    model: Any, part: Part, warnings: list[Warning]
 ) -> tuple[PartScores, tuple[Response, Response]]:
     """Return the scores of a part, and the responses that they come from.
 
@@ -52,7 +52,7 @@ def score_part(
     return PartScores.model_validate(scores), responses
 
 
-def _score_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
+def _score_along(model: Any, part: Part, warnings: list[Warning]) -> PartScores:
     """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     assert part.source is not None
     whole = len(part.record) == rows_of(part.source)  # its tests are those of the result

@@ -54,7 +54,7 @@ def figures(
         "simulation": plots.output_figure(free, f"free run, {where}"),
     }
     found = result.residuals
-    units = {channel.name: channel.unit for channel in (*fit.model.inputs, *fit.model.outputs)}
+    units = fit.model.units
     for name, tests in (
         ("one-step", found and found.one_step),
         ("free-run", found and found.free_run),

@@ -586,7 +586,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
             f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
             "its training."
         )
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     return MotionEstimate(
         model=model,
         status=Status(Ending.EXACT, 0, 0.0, np.nan),

@@ -175,7 +175,7 @@ class MotionEstimate(Estimate):
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
     """Return the numbers before any split: θ is the one fitted beside the learner."""
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
 
@@ -184,7 +184,7 @@ def _with_split(
 ) -> MotionEstimate:
     """Return the estimate with p̂, intervals and warnings of a split."""
     motion, numbers = fit.problem.motion, fit.model.numbers
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     bounds = motion.coordinates.bounds
     values = motion.coordinates.physical(split.q)
     at_bound = {
@@ -264,7 +264,7 @@ def free_covariance(
     statistics = fit.model.statistics if statistics is None else statistics
     if statistics.gram is None or statistics.middle is None:
         return None
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     low, high = fit.problem.motion.coordinates.bounds
     moves = np.concatenate(
         [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]

@@ -38,7 +38,7 @@ def _evaluate(
     """
 
     def one(row: Any) -> Any:
-        phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
+        phi = form.phi(row)
         known = form.baseline.known(row, form.layout, form.outputs, jnp)
         added = known + form.at(numbers, row).learner
         reach = jnp.zeros_like(added)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, quick_jit
+from orthaug._base.jax import AnyArray, Array, jax, quick_jit
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
@@ -98,7 +98,7 @@ class SegmentedMotion(SegmentedProblem):
             like=like,
         )
 
-    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+    def numbers(self, c: AnyArray, w: Any, tilt: Any = None) -> Numbers:
         numbers = super().numbers(c, w, tilt)
         return (
             numbers if self.predictor is None else numbers._replace(correction=self.predictor.gain)
@@ -232,17 +232,20 @@ class SegmentedMotion(SegmentedProblem):
             mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan
 
-    def runs(self, c: Vector, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
+    def runs(self, c: AnyArray, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
         """Return the states along every segment from these starts."""
         return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
 
     def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
         """Return states (N, nx) and inputs (N, nu) of the segments' runs, on scored rows."""
-        runs = self.runs(c, w, states)
+        x, inputs = self.steps(c, w, states)
+        return x, self.dynamics.at_samples(self.numbers(c, w), x, inputs)
+
+    def steps(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
+        """Return states (N, nx) of the segments' runs and inputs of their steps, on scored rows."""
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
-        states = np.moveaxis(runs, -1, 1)[scored]
-        return states, self.dynamics.at_samples(self.numbers(c, w), states, inputs)
+        return np.moveaxis(self.runs(c, w, states), -1, 1)[scored], inputs
 
     @property
     def _washout(self) -> int:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
@@ -138,12 +139,16 @@ class SegmentedProblem:
         """Number of scored errors."""
         return self.segments.count * len(self.dynamics.outputs)
 
-    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+    def numbers(self, c: AnyArray, w: Any, tilt: Any = None) -> Numbers:
         """Return the model's numbers before the split."""
         scaling = self.scaling
         return Numbers(
             c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt
         )
+
+    def reporting(self, progress: RunProgress) -> RunProgress:
+        """Return the progress of a run whose losses are sums of squares in this unit."""
+        return lambda iteration, loss: progress(iteration, loss * self.rms**2 / self.residuals)
 
     def descend(
         self,

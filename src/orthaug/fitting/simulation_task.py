@@ -93,12 +93,7 @@ class SimulationTask(ABC):
         Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away
         over whole experiments, runs are compared over segments.
         """
-        own = self.plan
-
-        def report(iteration: int, loss: float) -> None:
-            progress(iteration, loss * own.rms**2 / own.residuals)
-
-        plan, physics = self.train_physics_only(solver, structure, report)
+        plan, physics = self.train_physics_only(solver, structure, self.plan.reporting(progress))
         if physics is None:
             return self
         rms = plan.rms * float(np.sqrt(physics.end.point.misfit / plan.residuals))
@@ -177,9 +172,7 @@ class SimulationTask(ABC):
         ):  # one prior deviation of the weights for one of what is left
             ridge = best.loss / plan.residuals
 
-        def report(iteration: int, loss: float) -> None:
-            progress(iteration, loss * plan.rms**2 / plan.residuals)
-
+        report = plan.reporting(progress)
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         kept = {"ceiling": ceiling}
         first = None

@@ -263,7 +263,7 @@ def _slopes_along(
     form: LaggedDynamics, numbers: Numbers, rows: Any, root: Any
 ) -> Float[Array, "r ny m"]:
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
-    phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
+    phi = jax.vmap(lambda row: form.phi(row), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
     z = form.features.evaluate(rows.T, form.layout, jnp)
     z = ((z - numbers.centre) / numbers.halfwidth).T

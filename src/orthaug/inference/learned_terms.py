@@ -96,7 +96,7 @@ def equation(model: Any, writing: str = "text") -> str:
     written = []
     for left, physics in _physics(model, writing):
         own = [(term.coefficient, term.term) for term in terms if term.added_to == left[0]]
-        pieces = [*physics, *(_product(value, text, writing, model) for value, text in own)]
+        pieces = [*physics, *(_product(value, text, writing) for value, text in own)]
         signed = [f"- {piece[1:]}" if piece.startswith("-") else f"+ {piece}" for piece in pieces]
         total = " ".join(signed).removeprefix("+ ") or "0"
         written.append(f"{left[1]} = {'-' + total[2:] if total.startswith('- ') else total}")
@@ -130,7 +130,7 @@ def _targets(model: Any) -> list[tuple[str, str]]:
 
 
 def _units(model: Any) -> dict[str, str]:
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+    units = model.units
     if _moves(model):
         units |= {state.name: state.unit for state in model.form.motion.states}
     return units
@@ -159,7 +159,7 @@ def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]
         found.append(
             (
                 (channel.name, left),
-                [_product(value, text, writing, model) for value, text in values],
+                [_product(value, text, writing) for value, text in values],
             )
         )
     return found
@@ -186,7 +186,7 @@ def _expression(text: str, writing: str) -> str:
     return latex(Expression(text)) if writing == "latex" else text
 
 
-def _product(value: float, text: str, writing: str, model: Any) -> str:
+def _product(value: float, text: str, writing: str) -> str:
     number = repr(float(value)) if writing == "python" else f"{value:.6g}"
     if writing == "latex":
         number = _power_of_ten(number)

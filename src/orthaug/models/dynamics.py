@@ -14,15 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
 from orthaug.models.learners import Bound, nothing_learned
 from orthaug.physics.parameters import Coordinates
 
 BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
-
-AnyArray = Any  # of NumPy or of JAX
 
 
 class Numbers(NamedTuple):
@@ -52,6 +50,11 @@ class Numbers(NamedTuple):
     """
     correction: Any = None
     """(nx, ny), the gain of a predictor (`models.predictor`); None for other dynamics."""
+
+    @property
+    def c(self) -> AnyArray:
+        """θ − θ_aux (nt,): θ as it was fitted beside the learner, before the split."""
+        return self.theta - self.theta_aux
 
     @property
     def free(self) -> Numbers:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import AnyArray, Array, ArrayModule, jax, jnp
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
@@ -184,16 +184,20 @@ class LaggedDynamics:
         lag, output = np.array(self.fed_back, dtype=int).reshape(-1, 2).T
         return xp.concatenate([past[lag - 1, output], inputs])
 
+    def phi(self, x: AnyArray, xp: ArrayModule = jnp) -> AnyArray:
+        """Return φ(x), (…, ny, nθ), of regressors (…, nx)."""
+        return self.baseline.phi(x, self.layout, self.outputs, xp)
+
     def at(self, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
         """Return the prediction at one regressor x (nx,), in parts."""
-        phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
+        phi = self.phi(x)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         physics = known + phi @ numbers.theta
         z = self.features.evaluate(x, self.layout, jnp)
         share: Any = 1.0
         if numbers.limits is not None:
             inside = clip_to_range(numbers.limits, z)
-            phi = self.baseline.phi(x + numbers.pull @ (inside - z), self.layout, self.outputs, jnp)
+            phi = self.phi(x + numbers.pull @ (inside - z))
             share, z = remaining_factor(self.beyond, numbers.limits, z), inside
         raw = _learned_output(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)

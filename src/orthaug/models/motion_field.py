@@ -117,10 +117,7 @@ class MotionField:
         moved = numbers.pull @ (inside - z)
         share = remaining_factor(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
-        split, own = (
-            self.motion.coordinates.physical(q, jnp)
-            for q in (numbers.theta, numbers.theta - numbers.theta_aux)
-        )
+        split, own = (self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.c))
         held = (
             self.learned_rows(own, x_in, u_in)
             - self.learned_rows(split, x_in, u_in)
@@ -157,7 +154,7 @@ class MotionField:
 
     def parameters(self, numbers: Numbers) -> Any:
         """Return the physical parameters (np,) beside the learner, before any split."""
-        return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
+        return self.motion.coordinates.physical(numbers.c, jnp)
 
     def linear_part(self, numbers: Numbers) -> Any:
         """Return ∂f/∂x of the physics at the origin; 0 where it has none."""
@@ -229,7 +226,7 @@ def _parts(
 
     def at(x: Any, u: Any) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)
-        whole = physics(numbers.theta - numbers.theta_aux, x, u)
+        whole = physics(numbers.c, x, u)
         return split, whole - split + (form.addition(numbers, x, u) if form.learns else 0.0)
 
     return jax.vmap(at)(x, u)

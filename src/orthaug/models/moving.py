@@ -84,7 +84,7 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
 
     ∂/∂w is that of the learned equations only, (nl, nw).
     """
-    c = numbers.theta - numbers.theta_aux
+    c = numbers.c
     coordinates = form.motion.coordinates
 
     def physics(x: Any, c: Any) -> Any:
@@ -124,7 +124,7 @@ def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slope
 
 def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     """Return y and its slopes at one point."""
-    c = numbers.theta - numbers.theta_aux
+    c = numbers.c
 
     def physics(x: Any, c: Any) -> Any:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)

@@ -130,7 +130,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
     x = x[:: max(1, -(-len(x) * len(form.outputs) // MOST_CELLS))]
     with np.errstate(all="ignore"):
         target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
-        phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
+        phi = np.asarray(form.phi(x, np))
         z = np.asarray(form.features.evaluate(x, form.layout, np))
     finite = (
         np.isfinite(target).all(axis=1)
@@ -152,8 +152,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
         signals=(*own, *_rates_of_change(form.outputs, own)),
         seen=len(own),
-        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-        | {SAMPLING_TIME: "s"},
+        units=model.units | {SAMPLING_TIME: "s"},
         parse=lambda text: parse(text, constants),
         evaluate=lambda expression: expression.evaluate(columns, np),
         moved=lambda along: c + along,
@@ -179,8 +178,7 @@ def _of_motion(model: Model[MotionDynamics], record: Record) -> LearnedLineariza
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = tuple(dict.fromkeys(str(entry) for entry in form.features))
     z = np.asarray(form.seen(x.T, u.T, np)).T
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-    units |= {parameter.name: parameter.unit for parameter in motion.parameters}
+    units = model.units | {parameter.name: parameter.unit for parameter in motion.parameters}
     return LearnedLinearization(
         target=target,
         physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),

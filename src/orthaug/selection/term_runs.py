@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, positive
 from orthaug._base.jax import jax, jnp
 from orthaug.data.expressions import Lag, parse
 from orthaug.data.record import Record
@@ -176,7 +176,7 @@ class TermRuns:
                 largest = np.abs(
                     np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)
                 ).max(axis=1)
-            runs = replace(runs, sizes=np.where(np.isfinite(largest) & (largest > 0), largest, 1.0))
+            runs = replace(runs, sizes=positive(largest))
         if criterion.one_step:
             return runs
         trial = criterion.free_run
