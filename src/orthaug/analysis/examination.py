@@ -11,6 +11,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.attempt import attempt
+from orthaug.analysis.budget import Budget
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
@@ -31,7 +32,9 @@ from orthaug.analysis.validation import (
 )
 from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import fit as train
+from orthaug.fitting.status import Status
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.inference.over_experiments import differing_warning
 from orthaug.models.response import Response
@@ -52,8 +55,7 @@ _FINDINGS = (
 class Examination:
     """A fit with the standard errors that its residual calls for, and what was found on it."""
 
-    fit: Any
-    """The `Estimate`."""
+    fit: Estimate
     evidence: Evidence
     result: Findings
     responses: Mapping[str, tuple[Response, Response]]
@@ -75,7 +77,7 @@ def examine(fit: Any, evidence: Evidence) -> Examination:
     return doubt(with_verdict(score_and_analyse(fit, evidence)))
 
 
-def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
+def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     """Return a fit scored on every part, with the findings on it but verdict and doubts."""
     warnings: list[Warning] = [*evidence.warnings, *fit.warnings]
     scores, responses = {}, {}
@@ -114,7 +116,7 @@ def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
 
 
 def _analyse(
-    fit: Any,
+    fit: Estimate,
     evidence: Evidence,
     responses: Mapping[str, tuple[Response, Response]],
     warnings: list[Warning],
@@ -157,7 +159,7 @@ def _analyse(
     }
 
 
-def _parameters(fit: Any) -> list[ParameterResult]:
+def _parameters(fit: Estimate) -> list[ParameterResult]:
     """Return the parameters as results list them; without values where training failed."""
     problem = fit.problem
     values = fit.values if fit.status.ok else np.full(len(problem.names), np.nan)
@@ -174,7 +176,7 @@ def _parameters(fit: Any) -> list[ParameterResult]:
 def _with_biases(
     rows: Sequence[ParameterResult],
     determined: Sequence[str] | None,
-    budget: Any,
+    budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
     """Return the parameters, with whether the learner could imitate them and what biases them.
@@ -192,7 +194,7 @@ def _with_biases(
     ]
 
 
-def _of_learner(fit: Any, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
+def _of_learner(fit: Estimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
     """Return intervals over experiments, and the equations of a learner of terms."""
     over = attempt(
         "the errors over experiments",
@@ -277,7 +279,7 @@ def _over_experiments(
     return content
 
 
-def _status(fit: Any, warnings: Sequence[Warning]) -> Any:
+def _status(fit: Estimate, warnings: Sequence[Warning]) -> Status:
     """Return how training ended.
 
     For a model whose free run diverges, the message begins with that.
@@ -325,7 +327,7 @@ def _one_step_only(
     return [Warning("one_step_only", text)]
 
 
-def _for_observers(fit: Any, verdict: str, warnings: list[Warning]) -> Any:
+def _for_observers(fit: Estimate, verdict: str, warnings: list[Warning]) -> Estimate:
     """Return the fit with a model that keeps what observers need.
 
     These are the verdict on the residual, and the two noises.
@@ -370,7 +372,7 @@ def with_verdict(made: E) -> E:
     return replace(made, result=made.result.changed(validation=verdict, warnings=warnings))
 
 
-def _physics_alone(fit: Any) -> Any:
+def _physics_alone(fit: Estimate) -> Estimate:
     """Return the fit of physics alone that the learner is compared to.
 
     It is the one that was made already, or one by the same criterion.
@@ -434,7 +436,7 @@ def judge_fit(
     return judge(trials, beyond)
 
 
-def was_stopped(fit: Any) -> bool:
+def was_stopped(fit: Estimate) -> bool:
     """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 

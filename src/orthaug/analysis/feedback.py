@@ -64,7 +64,7 @@ def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:
     return _WIDTH * positive(points.std(axis=0))
 
 
-def by_differences(function: Any, point: Any, width: Any) -> Any:
+def by_differences(function: Any, point: Array, width: Array) -> Array:
     """Return ∂function/∂point (outputs, n) from differences of `width` (n,)."""
     aside, each = jnp.diag(width), jax.vmap(function)
     return ((each(point + aside) - each(point - aside)) / (2 * width[:, None])).T
@@ -76,12 +76,12 @@ def _transitions(
     numbers: Numbers,
     states: Float[Array, "m n0"],
     inputs: Float[Array, "m nu"],
-    width: Any,
+    width: Array,
 ) -> Float[Array, "m n0 n0"]:
     """Return A_k at m points, by differences where a learner has no derivative."""
 
-    def at(state: Any, row: Any) -> Any:
-        def next_state(state: Any) -> Any:
+    def at(state: Array, row: Array) -> Array:
+        def next_state(state: Array) -> Array:
             return form.step(numbers, state, row)[0]
 
         return (

@@ -141,11 +141,11 @@ def _gradients(form: LaggedDynamics, numbers: Numbers, x: Matrix) -> Iterator[li
 
 @partial(quick_jit, static_argnames="form")
 def _gradient_rows(
-    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Any
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Array
 ) -> tuple[Array, Array]:
     """Return ∂g/∂x (m, ny, nx) and ∂φ/∂x, by differences of `width` (nx,) without a derivative."""
 
-    def g(row: Any) -> Any:
+    def g(row: Array) -> Array:
         return form.at(numbers, row).total
 
     def phi(row: Any) -> Any:
@@ -183,7 +183,7 @@ def _weight_squares(
 ) -> Float[Array, "m ny"]:
     """Return Σ_w (∂²g/∂w∂x)² along one direction of x."""
 
-    def slopes(row: Any) -> Any:
+    def slopes(row: Array) -> Array:
         return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(
             numbers.weights
         )

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -54,7 +53,7 @@ class FreeRunPoint:
     segmented: SegmentedMotion
     c: Vector
     w: Vector
-    states: Any
+    states: np.ndarray
     weight: Matrix
     """(ny, ny), multiplies errors."""
     ridge: float | Vector = 0.0
@@ -76,7 +75,7 @@ class TermsResponse:
     numbers: Numbers
     information: Matrix
     gradient: Vector
-    slope: Any
+    slope: np.ndarray | None
     fitted: Bool[np.ndarray, "n"]
     terms: int
     segments: Segments
@@ -241,7 +240,7 @@ def _learned_change(
     x: Float[Array, "m nx"],
     u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
-    def learned_output(w: Any) -> Any:
+    def learned_output(w: Array) -> Array:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
 
     return jax.jvp(learned_output, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]

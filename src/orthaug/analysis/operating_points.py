@@ -266,7 +266,7 @@ def _solve_rest(search: Search, start: Vector, unit: Vector) -> Vector | None:
 
     free, point = search.free, start.copy()
 
-    def at(values: Any) -> tuple[Any, Any]:
+    def at(values: Vector) -> tuple[Any, Any]:
         point[free] = start[free] + values * search.scale[free]
         value, slope, _ = search.equations(point)
         return value / unit, slope[:, free] / unit[:, None] * search.scale[free]

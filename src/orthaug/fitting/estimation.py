@@ -249,7 +249,7 @@ def _checked(request: Request) -> Request:
     return replace(request, learner=declared(request.learner))
 
 
-def _fit_once(plan: FitPlan[Any]) -> Any:
+def _fit_once(plan: FitPlan[Any]) -> Estimate:
     """Return the estimate of one problem with one criterion."""
     problem, request, criterion = plan.problem, plan.request, plan.settled()
     blocks, validated = check_blocks(request.blocks), request.validation is not None

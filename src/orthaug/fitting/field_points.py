@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def field_under(
-    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
+    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: np.ndarray
 ) -> tuple[Field, float, tuple[Warning, ...]]:
     """Return the points of a measure, its support by the data, and warnings.
 
@@ -54,7 +54,7 @@ def field_under(
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 
-def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
+def sizes_learned(segmented: SegmentedMotion, c: Vector, x: Matrix, u: Matrix) -> Vector:
     """Return the size (nl,) of each learned equation and output over the runs."""
     motion = segmented.problem.motion
     with np.errstate(all="ignore"):

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import Warning
@@ -57,7 +57,7 @@ class MotionEstimate(Estimate):
     segmented: SegmentedMotion = field(repr=False)
     states: Any = field(repr=False)
     """The segments' starts, as estimated."""
-    slope: Any = field(repr=False)
+    slope: Float[np.ndarray, "k m nx n"] | None = field(repr=False)
     """How they follow the unknowns (k, m, nx, n), less its sign; None where that is not known."""
     alone: Vector = field(repr=False)
     """The coordinates of physics alone, where the nearest physics is searched from."""

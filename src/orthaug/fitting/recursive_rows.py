@@ -37,7 +37,7 @@ def _evaluate(
     That is 1 at the limit of the training data.
     """
 
-    def one(row: Any) -> Any:
+    def one(row: Array) -> Array:
         phi = form.phi(row)
         known = form.baseline.known(row, form.layout, form.outputs, jnp)
         added = known + form.at(numbers, row).learner

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray
@@ -55,7 +56,7 @@ class TrialInMemory(NamedTuple):
 
     objective: FreeRunObjective
     point: TrialPoint
-    slope: Any
+    slope: Float[np.ndarray, "k m n0 n"] | None
 
 
 class Layout(NamedTuple):
@@ -139,7 +140,7 @@ class SegmentedProblem:
         """Number of scored errors."""
         return self.segments.count * len(self.dynamics.outputs)
 
-    def numbers(self, c: AnyArray, w: Any, tilt: Any = None) -> Numbers:
+    def numbers(self, c: AnyArray, w: Vector, tilt: Any = None) -> Numbers:
         """Return the model's numbers before the split."""
         scaling = self.scaling
         return Numbers(
@@ -156,7 +157,7 @@ class SegmentedProblem:
         p: Vector,
         solver: LevenbergMarquardt,
         progress: RunProgress = quiet,
-        states: Any = None,
+        states: np.ndarray | None = None,
         **options: Any,
     ) -> FreeRunFit:
         """Descend from p to the end of the run.
@@ -240,7 +241,7 @@ class SegmentedProblem:
             else noise_covariance(squares, np.full(ny, self.segments.count - used))
         )
 
-    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+    def mean_square(self, c: Vector, w: Vector, tilt: Any = None) -> float:
         """Return the mean of squared errors over whole experiments.
 
         Outputs in their deviations.

@@ -22,7 +22,7 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
-from orthaug.fitting.segmented_problem import FreeRunFit
+from orthaug.fitting.segmented_problem import FreeRunFit, SegmentedProblem
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.minimize import LEARNED, Descent
 from orthaug.fitting.structures import Structure
@@ -36,7 +36,7 @@ class StartPoint(NamedTuple):
     """A possible start of a run: p, the segments' states, the loss, a silent learner or not."""
 
     p: Vector
-    states: Any
+    states: np.ndarray
     loss: float
     silent: bool
 
@@ -70,7 +70,7 @@ class SimulationTask(ABC):
     ) -> tuple[Any, FreeRunFit | None]:
         """Return the problem and physics alone trained on it; None where no run is finite."""
 
-    def scaled(self, plan: Any, physics: FreeRunFit) -> Any:
+    def scaled(self, plan: SegmentedProblem, physics: FreeRunFit) -> SegmentedProblem:
         """Return the problem with its learner scaled by the run of physics alone."""
         return plan
 

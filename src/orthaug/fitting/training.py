@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import finite_or_none
+from orthaug._base.checks import Vector, finite_or_none
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import jax
+from orthaug._base.jax import AnyArray, jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
 from orthaug.data.record import Record
-from orthaug.fitting.estimates import Restart
+from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
@@ -28,11 +28,14 @@ from orthaug.fitting.held_out import (
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
+from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.setup import FOLD_ITERATIONS
 from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry_warnings
+from orthaug.fitting.solvers.compiled import TrainingRun
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
+from orthaug.models.rows import Engine
 
 # of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
 _INFLATION = 1.4
@@ -59,7 +62,7 @@ class PlannedRun(NamedTuple):
     """One run to be made: its seed, initial weights and regularization."""
 
     seed: int
-    weights: Any
+    weights: AnyArray
     regularization: str | float
 
 
@@ -127,7 +130,7 @@ def train(
     choice: Choice,
     progress: ProgressCallback,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
-) -> Any:
+) -> Estimate:
     """Run from every start and conclude with the best.
 
     Args:
@@ -197,7 +200,7 @@ def train(
     return replace(estimate, **found, warnings=warnings)
 
 
-def _physics_to_compare(task: Task, structure: Structure) -> Any:
+def _physics_to_compare(task: Task, structure: Structure) -> Estimate | None:
     """Return the estimate of physics alone, to compare with that of a learner.
 
     It is least squares one step ahead, also where θ has a penalty. None without a learner, and
@@ -210,7 +213,13 @@ def _physics_to_compare(task: Task, structure: Structure) -> Any:
 
 
 def _restart(
-    start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool
+    start: PlannedRun,
+    run: FreeRunFit | TrainingRun,
+    loss: float,
+    error: float,
+    score: float,
+    *,
+    chosen: bool,
 ) -> Restart:
     return Restart(
         seed=start.seed,
@@ -224,7 +233,7 @@ def _restart(
     )
 
 
-def _cross_validation(task: Task, run: Any) -> float:
+def _cross_validation(task: Task, run: TrainingRun) -> float:
     """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
 
     Infinite where it uses up all rows.
@@ -249,7 +258,7 @@ def _run_all(
     solver: Solver,
     choice: Choice,
     progress: ProgressCallback,
-    runner: Any,
+    runner: Engine | Threads,
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Make every planned run, and weaker regularizations where evidence silenced the learner.
 
@@ -273,7 +282,7 @@ def _run(
     structure: Structure,
     solver: Solver,
     progress: ProgressCallback,
-    runner: Any,
+    runner: Engine | Threads,
 ) -> tuple[list[PlannedRun], list[Any]]:
     """Return every planned run; one that fails is made again from the seeds that follow."""
     made, given = list(starts), (task, solver, structure)
@@ -299,7 +308,7 @@ def _run(
 
 def _one_run(
     given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
-) -> Any:
+) -> FreeRunFit | TrainingRun:
     task, solver, structure = given
     return task.run(solver, start.weights, structure, start.regularization, report)
 
@@ -337,7 +346,7 @@ def _held_out(
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    runner: Any,
+    runner: Engine | Threads,
 ) -> HeldOutErrors | None:
     """Return held-out errors: of runs on the validation record, or of runs on folds.
 
@@ -400,7 +409,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
 
 
-def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
+def _errors(fit: Estimate, record: Record, unit: Vector) -> Pieces:
     """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
@@ -426,7 +435,7 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Any:
+def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Estimate:
     rows, learned = task.physics_alone()
     return replace(rows.conclude(structure, learned, briefly=briefly), criterion=task.criterion)
 

@@ -15,6 +15,7 @@ from orthaug.data.expressions import Expression
 from orthaug.data.terms import outside_brackets
 from orthaug.data.writing import coefficient_unit, latex
 from orthaug.inference.covariance import interval
+from orthaug.models.model import Model
 from orthaug.models.terms import Terms
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class LearnedTerm:
     ci95: tuple[float, float] | None = None
 
 
-def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
+def learned_terms(model: Model) -> tuple[LearnedTerm, ...]:
     """Return the learned terms of a fitted model, the largest contribution first.
 
     Empty where the learner is no sum of terms.
@@ -103,16 +104,16 @@ def equation(model: Any, writing: str = "text") -> str:
     return "\n".join(written)
 
 
-def _features(model: Any) -> tuple[Expression, ...]:
+def _features(model: Model) -> tuple[Expression, ...]:
     entries = model.form.features
     return entries if isinstance(entries, tuple) else entries.entries
 
 
-def _moves(model: Any) -> bool:
+def _moves(model: Model) -> bool:
     return hasattr(model.form, "motion")
 
 
-def _targets(model: Any) -> list[tuple[str, str]]:
+def _targets(model: Model) -> list[tuple[str, str]]:
     """Return the name and unit of the quantity that each row of weights is added to."""
     if not _moves(model):
         return [(channel.name, channel.unit) for channel in model.outputs]
@@ -129,7 +130,7 @@ def _targets(model: Any) -> list[tuple[str, str]]:
     ]
 
 
-def _units(model: Any) -> dict[str, str]:
+def _units(model: Model) -> dict[str, str]:
     units = model.units
     if _moves(model):
         units |= {state.name: state.unit for state in model.form.motion.states}

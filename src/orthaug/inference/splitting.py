@@ -492,11 +492,11 @@ def rest_of(
 
 @partial(quick_jit, static_argnames="form")
 def slopes_at(
-    form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, q: Array, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m r np"]:
     """Return ∂(f, h)/∂q at points."""
 
-    def value_and_slope(q: Any, x: Any, u: Any) -> Any:
+    def value_and_slope(q: Array, x: Array, u: Array) -> Array:
         p = form.motion.coordinates.physical(q, jnp)
         return jnp.concatenate(
             [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
