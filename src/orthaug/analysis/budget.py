@@ -334,7 +334,7 @@ def budget_by(
     shifts = np.array([entry.shift for entry in nameless]).reshape(-1, len(bias))
     other = np.linalg.norm(shifts, axis=0)
     candidates = _candidates(terms, found, shifts, declared)
-    std = np.full(len(bias), np.nan) if fit.std is None else fit.std
+    std = fit.known_std
     ends = hull(value, std, fit.freedom, candidates, other)
     ends = np.clip(ends, *terms.bounds.T[:, :, None])
     owners = _owners(found, np.array([causes.moved for causes in found]))

@@ -268,8 +268,7 @@ class MotionTerms:
         fit = self.fit
         if fit is None or self.learned is None or (fit.split_by.share or 0.0) >= _NOTHING:
             return False
-        std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-        return not np.any(np.abs(bias) > _UNMOVED * std)
+        return not np.any(np.abs(bias) > _UNMOVED * fit.known_std)
 
     def noise_share(self) -> float:
         """Return ν, the share of noise in the learner, by the band of the learned curve."""

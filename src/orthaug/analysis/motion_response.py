@@ -303,8 +303,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     step = np.zeros(len(free))
     step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
-    std = np.full(len(c), np.nan) if fit.std is None else fit.std
-    errors = np.abs(value) / np.where(std > 0, std, np.nan)
+    errors = np.abs(value) / np.where(fit.known_std > 0, fit.known_std, np.nan)
     found = SubstepBias(motion.names, substeps, value, errors)
     return replace(found, warnings=_warnings(found, fit))
 

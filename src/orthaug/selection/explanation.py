@@ -190,11 +190,10 @@ def added_to_motion(
         substeps=motion.substeps,
         hold=motion.hold,
     )
-    own = "next" if motion.scheme.discrete else "derivative"
     states = {state.name for state in motion.states}
     places = dict.fromkeys(one.added_to for one in added)
     equations = tuple(
-        (f"motion.states.{name}", own, texts[name])
+        (f"motion.states.{name}", motion.equation_key, texts[name])
         if name in states
         else (f"motion.outputs.{name}", "expression", texts[name])
         for name in places
