@@ -14,12 +14,12 @@ input to state.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jnp
+from orthaug._base.jax import AnyArray, Array, jnp
+from orthaug.models.learners import Learner
 
 BEYOND = ("auto", "hold", "fade", "free")
 """What `learner.beyond` may be; `auto` is hold for lagged physics, fade for motions, free for
@@ -35,7 +35,7 @@ _AFFINE = 1e-9  # of a feature's size over the probes
 _PROBES = 8  # more than the coefficients of an affine function
 
 
-def beyond_of(learner: Any, usual: str) -> str:
+def beyond_of(learner: Learner, usual: str) -> str:
     """Return how a learner's correction behaves beyond its training range.
 
     It is as declared, or `usual` for the physics where the declaration is `auto`.
@@ -93,12 +93,12 @@ def pull_of(features: Callable[[Matrix], Matrix], points: Matrix) -> Matrix:
     return pull
 
 
-def clip_to_range(limits: Any, z: Any) -> Any:
+def clip_to_range(limits: AnyArray, z: Array) -> Array:
     """Return the features moved onto the range, z̄ (nz,)."""
     return jnp.clip(z, limits[0], limits[1])
 
 
-def remaining_factor(beyond: str, limits: Any, z: Any) -> Any:
+def remaining_factor(beyond: str, limits: AnyArray, z: Array) -> Array | float:
     """Return the factor a of the correction at features z (nz,): 1 where it is held."""
     if beyond != "fade":
         return 1.0
@@ -107,7 +107,7 @@ def remaining_factor(beyond: str, limits: Any, z: Any) -> Any:
     return jnp.exp(-jnp.sum(apart**2) / FADED**2)
 
 
-def outside(limits: Any, features: Matrix) -> Vector:
+def outside(limits: Matrix, features: Matrix) -> Vector:
     """Return where rows of features (N, nz) leave the range, (N,)."""
     with np.errstate(all="ignore"):
         return ~((features >= limits[0]) & (features <= limits[1])).all(axis=1)

@@ -217,11 +217,11 @@ class LaggedDynamics:
         """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 
-    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         parts = self.at(numbers, self.regressor(state, inputs))
         return self._push(state, parts.total), parts
 
-    def _push(self, state: Any, y: Any) -> Any:
+    def _push(self, state: Array, y: Array) -> Array:
         """Return the state (n0, …) one step later, when y (ny, …) is the newest output."""
         return jnp.concatenate([y, state[: -len(self.outputs)]]) if self.memory else state
 
@@ -232,7 +232,7 @@ class LaggedDynamics:
         return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))
 
     def tangents(
-        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+        self, numbers: Numbers, state: Array, slopes: Any, inputs: Array
     ) -> tuple[Any, Any, Any, Any]:
         """Propagate `S_k = G_k + Σ_i A_{k,i} S_{k−i}`.
 
@@ -247,12 +247,12 @@ class LaggedDynamics:
         following = (slope, *slopes[:-1]) if self.memory else slopes
         return self._push(state, value), following, value, slope
 
-    def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
+    def _derivatives(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Any, Any]:
         """Return the value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ (ny, lags) of every fed-back lag."""
         leaves = self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
-        def predict(c: Any, leaves: list[Any], past: Any) -> Any:
+        def predict(c: Array, leaves: list[Any], past: Array) -> Array:
             return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[
                 1
             ].total

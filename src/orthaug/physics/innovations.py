@@ -42,7 +42,7 @@ class InnovationsForm(Motion):
 
     @cached_property
     def _plant(self) -> Motion:
-        return Motion(**self.declaration | {"parameters": self.parameters[: self.own]})
+        return Motion(**{**self.declaration, "parameters": self.parameters[: self.own]})
 
     @property
     def plant(self) -> Motion:
@@ -80,7 +80,7 @@ def innovations_form(motion: Motion) -> InnovationsForm:
         for state in motion.states
         for output in motion.outputs
     )
-    return InnovationsForm(**motion.declaration | {"parameters": (*motion.parameters, *gains)})
+    return InnovationsForm(**{**motion.declaration, "parameters": (*motion.parameters, *gains)})
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
@@ -226,7 +226,7 @@ class MotionResponse:
         x: Matrix,
         u: Matrix,
         rows: Matrix,
-        begins: Any,
+        begins: np.ndarray,
         weight: Matrix,
     ) -> MotionResponse:
         """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
@@ -282,7 +282,7 @@ class MotionResponse:
 
 @partial(jax.jit, static_argnames="form")
 def _derivatives(
-    form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
+    form: MotionDynamics, numbers: Numbers, x: Array, u: Array, rows: Array
 ) -> tuple[Any, Any]:
     """Return ∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepare(numbers)
@@ -389,14 +389,14 @@ def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
     return found
 
 
-def _share_beyond(model: Any, z: Matrix) -> float:
+def _share_beyond(model: Model, z: Matrix) -> float:
     """Return the share of the points with a feature outside its training range."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
     return float(np.mean(model.beyond(z)))
 
 
-def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
+def _tangent(model: Model, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
     """Return the learner's derivatives at its features z (M, nz)."""
     bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
     if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:
