@@ -72,7 +72,7 @@ class Examination:
 E = TypeVar("E", bound=Examination)
 
 
-def examine(fit: Any, evidence: Evidence) -> Examination:
+def examine(fit: Estimate, evidence: Evidence) -> Examination:
     """Return everything that is found on a fit: scores, verdict on the learner, doubts."""
     return doubt(with_verdict(score_and_analyse(fit, evidence)))
 

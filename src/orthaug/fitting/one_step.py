@@ -295,7 +295,7 @@ class OneStepTask(TrainingRows):
         )
 
     def _joint_least_squares(
-        self, solver: Any, w: Any, physics: Physics, progress: RunProgress
+        self, solver: Solver, w: Any, physics: Physics, progress: RunProgress
     ) -> GradientRun:
         """Run Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         nt = len(physics.outputs)

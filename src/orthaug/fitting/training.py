@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Vector, finite_or_none
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import AnyArray, jax
+from orthaug._base.jax import jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback
@@ -26,12 +26,10 @@ from orthaug.fitting.held_out import (
     squared_errors,
 )
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Task, TrainedLearner
+from orthaug.fitting.learned import FinishedRun, PlannedRun, Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
-from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.setup import FOLD_ITERATIONS
 from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry_warnings
-from orthaug.fitting.solvers.compiled import TrainingRun
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
@@ -56,14 +54,6 @@ def fold_solver(solver: Solver, rows: int, parameters: int, *, free_run: bool) -
     """
     affordable = int(_FOLD_WORK / max(rows * parameters, 1)) if free_run else 0
     return solver.at_most(max(FOLD_ITERATIONS, affordable))
-
-
-class PlannedRun(NamedTuple):
-    """One run to be made: its seed, initial weights and regularization."""
-
-    seed: int
-    weights: AnyArray
-    regularization: str | float
 
 
 def plan_runs(bound: Bound, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
@@ -109,7 +99,9 @@ class Choice:
             task.criterion.free_run is not None or (several and not self.scored)
         )
 
-    def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
+    def ranking(
+        self, task: Task, runs: Sequence[FinishedRun], errors: Sequence[float]
+    ) -> np.ndarray:
         """Return the value that is lowest for the best run: held-out error, score, or loss.
 
         On blocks other runs of its kind were judged: one that ended higher on its own data than
@@ -129,7 +121,7 @@ def train(
     solver: Solver,
     choice: Choice,
     progress: ProgressCallback,
-    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
+    runner: Engine | Threads = Threads(),  # noqa: B008  (it holds nothing)
 ) -> Estimate:
     """Run from every start and conclude with the best.
 
@@ -214,7 +206,7 @@ def _physics_to_compare(task: Task, structure: Structure) -> Estimate | None:
 
 def _restart(
     start: PlannedRun,
-    run: FreeRunFit | TrainingRun,
+    run: FinishedRun,
     loss: float,
     error: float,
     score: float,
@@ -233,7 +225,7 @@ def _restart(
     )
 
 
-def _cross_validation(task: Task, run: TrainingRun) -> float:
+def _cross_validation(task: Task, run: FinishedRun) -> float:
     """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
 
     Infinite where it uses up all rows.
@@ -259,7 +251,7 @@ def _run_all(
     choice: Choice,
     progress: ProgressCallback,
     runner: Engine | Threads,
-) -> tuple[list[PlannedRun], list[Any]]:
+) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Make every planned run, and weaker regularizations where evidence silenced the learner.
 
     The latter only where held-out rows can choose.
@@ -268,7 +260,7 @@ def _run_all(
     if not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
-    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
+    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[FinishedRun]]:
         return _run(
             task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
         )
@@ -283,7 +275,7 @@ def _run(
     solver: Solver,
     progress: ProgressCallback,
     runner: Engine | Threads,
-) -> tuple[list[PlannedRun], list[Any]]:
+) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return every planned run; one that fails is made again from the seeds that follow."""
     made, given = list(starts), (task, solver, structure)
     runs = list(runner.map(_one_run, given, made, progress))
@@ -308,12 +300,14 @@ def _run(
 
 def _one_run(
     given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
-) -> FreeRunFit | TrainingRun:
+) -> FinishedRun:
     task, solver, structure = given
     return task.run(solver, start.weights, structure, start.regularization, report)
 
 
-def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+def _replacement_warnings(
+    starts: Sequence[PlannedRun], runs: Sequence[FinishedRun]
+) -> list[Warning]:
     failed = [
         str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
     ]
@@ -341,8 +335,8 @@ def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
 def _held_out(
     task: Task,
     starts: Sequence[PlannedRun],
-    runs: Sequence[Any],
-    concluded: Callable[[int], Any],
+    runs: Sequence[FinishedRun],
+    concluded: Callable[[int], Estimate],
     structure: Structure,
     solver: Solver,
     choice: Choice,
@@ -440,7 +434,9 @@ def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False
     return replace(rows.conclude(structure, learned, briefly=briefly), criterion=task.criterion)
 
 
-def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
+def _median(
+    task: Task, runs: Sequence[FinishedRun], members: Sequence[int], best: int
+) -> TrainedLearner:
     """Return the median of the members that have a value everywhere.
 
     The best one alone if it has none.

@@ -75,7 +75,7 @@ def learned_terms(model: Model) -> tuple[LearnedTerm, ...]:
     return tuple(sorted(found, key=lambda term: -term.largest))
 
 
-def equation(model: Any, writing: str = "text") -> str:
+def equation(model: Model, writing: str = "text") -> str:
     """Return the fitted model with its numbers, an equation per output or per motion equation.
 
     Args:
@@ -137,7 +137,7 @@ def _units(model: Model) -> dict[str, str]:
     return units
 
 
-def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
+def _physics(model: Model, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
     """Return each equation's name and left side, and its terms of the physics."""
     if _moves(model):
         return _rates(model, writing)
@@ -166,7 +166,7 @@ def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]
     return found
 
 
-def _rates(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
+def _rates(model: Model, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
     motion = model.form.motion
     if motion.functions is not None:
         raise InputError("the physics are Python functions, which cannot be written as equations.")

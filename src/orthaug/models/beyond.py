@@ -14,12 +14,12 @@ input to state.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, Array, jnp
-from orthaug.models.learners import Learner
 
 BEYOND = ("auto", "hold", "fade", "free")
 """What `learner.beyond` may be; `auto` is hold for lagged physics, fade for motions, free for
@@ -35,7 +35,7 @@ _AFFINE = 1e-9  # of a feature's size over the probes
 _PROBES = 8  # more than the coefficients of an affine function
 
 
-def beyond_of(learner: Learner, usual: str) -> str:
+def beyond_of(learner: Any, usual: str) -> str:
     """Return how a learner's correction behaves beyond its training range.
 
     It is as declared, or `usual` for the physics where the declaration is `auto`.
