@@ -78,10 +78,6 @@ def _real_jax() -> Any:
     return jax
 
 
-def _real_jnp() -> Any:
-    return _real_jax().numpy
-
-
 class _LazyModule:
     """A module that is imported when one of its names is first asked for."""
 
@@ -251,7 +247,7 @@ def padded_length(rows: int) -> int:
 
 
 if not TYPE_CHECKING:
-    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(_real_jnp)
+    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(lambda: _real_jax().numpy)
     if (
         "jax" in sys.modules
     ):  # then it costs nothing, and what the user computes is in double precision too

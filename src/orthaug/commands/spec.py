@@ -10,7 +10,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -52,7 +51,7 @@ from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
 from orthaug.fitting.noise import ARMA, OF_MOTIONS, Innovations, Noise, Order
 from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
-from orthaug.fitting.structures import Structure
+from orthaug.fitting.structures import Structure, with_measure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
@@ -473,8 +472,7 @@ class Spec(Section):
         It has a measure where it splits θ.
         """
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
-        takes = any(field.name == "measure" for field in fields(structure))
-        return replace(structure, measure=measure) if takes and measure is not None else structure
+        return structure if measure is None else with_measure(structure, measure)
 
     def declared_measure(self, place: MeasurePlace) -> Measure:
         """Return the measure, with its data read from files."""

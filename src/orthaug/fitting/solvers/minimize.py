@@ -304,7 +304,10 @@ class _Rules:
             tried = tried._replace(begun=begun, control=control)
         if not tried.begun or not moved:
             return tried
-        return tried._replace(ridge=_next_ridge(self.objective, tried))
+        objective = self.objective
+        effective = effective_weights(tried.linear.hessian, tried.ridge, objective.physics)
+        ridge = evidence_ridge(objective, tried.point, effective, coloured=tried.coloured)
+        return tried._replace(ridge=ridge)
 
     def _try_step(self, iterate: _Iterate) -> _Iterate:
         """Return one damped step: accept it, or damp more."""
@@ -461,11 +464,6 @@ def _resume(objective: Any, paused: Pause) -> _Iterate:
         bool(begun),
         bool(paused.coloured),
     )
-
-
-def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
-    effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    return evidence_ridge(objective, iterate.point, effective, coloured=iterate.coloured)
 
 
 def evidence_ridge(
