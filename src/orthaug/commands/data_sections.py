@@ -331,3 +331,25 @@ class MotionSection(KindSection):
             substeps=substeps,
             hold=self.hold,
         )
+
+
+def with_source_in_motion(content: Any) -> Any:
+    """Return the content of a spec with `[physics.source]` in `[motion]`, where other code has it.
+
+    Raises:
+        ValueError: a source beside other physics.
+    """
+    physics = content.get("physics") if isinstance(content, Mapping) else None
+    if not isinstance(physics, Mapping) or "source" not in physics:
+        return content
+    beside = next((key for key in physics if key != "source"), None)
+    if beside is not None:
+        raise ValueError(
+            f"`physics.{beside}`: found beside [physics.source]; expected none, because the source "
+            "has parameters of its own"
+        )
+    motion = content.get("motion", {})
+    if not isinstance(motion, Mapping):
+        return content
+    others = {name: section for name, section in content.items() if name != "physics"}
+    return others | {"motion": {**motion, "source": physics["source"]}}

@@ -32,6 +32,7 @@ from orthaug.commands.data_sections import (
     MotionSection,
     Range,
     SourceSection,
+    with_source_in_motion,
 )
 from orthaug.commands.sections import (
     Count,
@@ -540,28 +541,6 @@ class Spec(Section):
         )
 
 
-def with_source_in_motion(content: Any) -> Any:
-    """Return the content of a spec with `[physics.source]` in `[motion]`, where other code has it.
-
-    Raises:
-        ValueError: a source beside other physics.
-    """
-    physics = content.get("physics") if isinstance(content, Mapping) else None
-    if not isinstance(physics, Mapping) or "source" not in physics:
-        return content
-    beside = next((key for key in physics if key != "source"), None)
-    if beside is not None:
-        raise ValueError(
-            f"`physics.{beside}`: found beside [physics.source]; expected none, because the source "
-            "has parameters of its own"
-        )
-    motion = content.get("motion", {})
-    if not isinstance(motion, Mapping):
-        return content
-    others = {name: section for name, section in content.items() if name != "physics"}
-    return others | {"motion": {**motion, "source": physics["source"]}}
-
-
 def spec_error(error: KeyedError) -> InputError:
     """Return an error in one key of a declaration in the words of a spec."""
     return SpecError(f"'{_SECTIONS.get(error.key, f'training.{error.key}')}'{error.words}.")
@@ -604,12 +583,6 @@ def _spec_model(registered: object) -> type[Spec]:
     return create_model("Spec", __base__=Spec, **fields)
 
 
-def _as_validated(content: dict[str, Any]) -> dict[str, Any]:
-    with suppress(ValueError):
-        return with_source_in_motion(content)
-    return content
-
-
 def load_spec(path: Path) -> Spec:
     """Read and check a spec file.
 
@@ -633,7 +606,9 @@ def load_spec(path: Path) -> Spec:
     try:
         return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        message = first_message(error, _as_validated(content), model)
+        with suppress(ValueError):
+            content = with_source_in_motion(content)
+        message = first_message(error, content, model)
         message = message.replace("motion.source", "physics.source")
         raise SpecError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
     except RecursionError:
