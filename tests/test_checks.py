@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from orthaug import InputError
-from orthaug._base.checks import check_number, finite_or_none, is_number
+from orthaug._base.checks import check_number, finite_or_none, free_name, is_number, positive
+from orthaug._base.lines import first_words, join_words
 
 
 @pytest.mark.parametrize(
@@ -45,3 +46,27 @@ def test_finite_or_none():
         finite_or_none(1.5) == 1.5
         and finite_or_none(float("inf")) is finite_or_none(float("nan")) is None
     )
+
+
+def test_a_scale_is_positive():
+    np.testing.assert_array_equal(
+        positive(np.array([2.0, 0.0, -1.0, np.nan, np.inf])), [2, 1, 1, 1, 1]
+    )
+
+
+def test_a_name_that_is_taken_gets_underscores():
+    assert [free_name(name, {"y", "y_"}) for name in ("x", "y")] == ["x", "y__"]
+
+
+@pytest.mark.parametrize(
+    ("words", "joined", "first"),
+    [
+        ([], "nothing", ""),
+        (["a"], "a", "a"),
+        (["a", "b"], "a and b", "a, b"),
+        (("a", "b", "c"), "a, b and c", "a, b and 1 more"),
+    ],
+)
+def test_words_in_a_sentence(words, joined, first):
+    assert join_words(words) == joined
+    assert first_words(words, 2) == first

@@ -132,12 +132,11 @@ def differences(model: Model, record: Record, row: int, along) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("along", ["simulation", "measured"])
-def test_transitions_are_differences(network, along):
+def test_transitions_are_differences(network):
     model, record = network
-    found = feedback(model, record, along=along)
+    found = feedback(model, record)
     measured = record.experiments[0].outputs
-    run = model.simulate(record).model if along == "simulation" else measured
+    run = model.simulate(record).model
     past = np.where(np.isfinite(run), run, measured)
     assert found.transition.shape == (147, 6, 6) and found.steps == 147 and found.skipped == 0
     for place in (0, 1, 60, 146):
@@ -694,7 +693,6 @@ def test_a_state_that_is_no_past_output():
     assert contracts.share == 1 and contracts.samples == 450
     again = feedback(model, record, response=model.simulate(record))
     np.testing.assert_array_equal(again.points.states, found.points.states)
-    assert np.all(feedback(model, record, along="measured").points.states == 1)
     whole = stability(model, record)
     assert whole.lipschitz is None and whole.warnings == () and "one-step" not in whole.text
     assert plainly(whole) == content(whole)
@@ -758,8 +756,6 @@ def test_arguments_refused(duffing, arguments, message):
 
 def test_records_refused(duffing):
     model, record = duffing
-    with pytest.raises(InputError, match="`along` must be one of simulation, measured; got 'both'"):
-        feedback(model, record, along="both")
     with pytest.raises(InputError, match="lacks the output y"):
         stability(model, Record.from_arrays(noise(50)))
     with pytest.raises(

@@ -170,7 +170,6 @@ def test_parts_are_the_loop_s(case):
         close(found[start:], [parts[i] for parts in rows])
         assert np.isnan(found[:start]).all()
     close(trajectory.baseline + trajectory.learner, trajectory.model)
-    close(trajectory.baseline_before + trajectory.learner_before, trajectory.model)
 
 
 def test_simulated_parts_add_up(case):

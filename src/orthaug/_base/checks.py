@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,13 @@ def check_unique(names: Iterable[str], what: str) -> None:
         if name in seen:
             raise InputError(f"{what} '{name}' is given twice; names must differ.")
         seen.add(name)
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """Return the name, with underscores behind it where it is taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def check_label(value: Any, what: str) -> str:
@@ -131,6 +138,11 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
             f"got {show(value)}."
         )
     return float(value)
+
+
+def positive(scale: Vector) -> Vector:
+    """Return the scale, 1 where it is not positive or not finite."""
+    return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
 
 
 def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:

@@ -28,18 +28,27 @@ from orthaug._base.errors import PrecisionError
 from orthaug._base.memory import return_free_memory
 
 if TYPE_CHECKING:
+    from types import ModuleType as ArrayModule
+
     import jax
     import jax.numpy as jnp
+    import numpy as np
     from jax import Array
+
+    AnyArray = np.ndarray | Array
 else:
     # In annotations; at run time jaxtyping checks shape and type of whatever is an array
     Array = Any
+    AnyArray = Any  # of NumPy or JAX
+    ArrayModule = Any  # NumPy, or JAX's
 
 _LENGTH = hashlib.sha256().digest_size
 _MAPS = 65_530  # of memory, that Linux grants a process unless it is told otherwise
 _MOST_MAPS = 0.5  # of these, up to which programs stay: one fit with its diagnosis takes 0.1
 __all__ = [
+    "AnyArray",
     "Array",
+    "ArrayModule",
     "is_traced",
     "jax",
     "jnp",
@@ -67,10 +76,6 @@ def _real_jax() -> Any:
 
     jax.config.update("jax_enable_x64", True)
     return jax
-
-
-def _real_jnp() -> Any:
-    return _real_jax().numpy
 
 
 class _LazyModule:
@@ -242,7 +247,7 @@ def padded_length(rows: int) -> int:
 
 
 if not TYPE_CHECKING:
-    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(_real_jnp)
+    jax, jnp = _LazyModule(_real_jax, jit=_late_jit), _LazyModule(lambda: _real_jax().numpy)
     if (
         "jax" in sys.modules
     ):  # then it costs nothing, and what the user computes is in double precision too

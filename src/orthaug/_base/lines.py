@@ -45,6 +45,17 @@ def plural(number: int, thing: str) -> str:
     return f"{number} {thing}" + ("" if number == 1 else "s")
 
 
+def join_words(words: Sequence[str]) -> str:
+    """Return "a", "a and b", "a, b and c"; "nothing" for none."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "nothing"
+
+
+def first_words(words: Sequence[str], most: int) -> str:
+    """Return so many words with commas, and how many more there are."""
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return ", ".join(words[:most]) + more
+
+
 def cut(text: str, most: int) -> str:
     """Return at most so many characters of a text, with … where it is longer."""
     return text if len(text) <= most else f"{text[: most - 1]}…"

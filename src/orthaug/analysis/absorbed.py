@@ -110,7 +110,7 @@ class Smoother:
             slopes = _slopes(rng, count, z.shape[1])
             centres = z[rng.integers(len(z), size=count)]
             waves = np.tanh(z @ slopes.T - np.sum(slopes * centres, axis=1))
-            phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+            phi = problem.phi(x)
             shared = (phi @ problem.shared.basis).reshape(len(x), -1)
             functions = np.column_stack([np.ones(len(x)), z, shared, waves])
         scale = np.sqrt(np.mean(functions**2, axis=0))
@@ -171,7 +171,7 @@ def term_effects(
 def _unseen(smoother: Smoother, term: Callable[[Matrix], Matrix], x: Matrix) -> TermAfterFit:
     problem = smoother.problem
     rows = problem.rows.x[smoother.every]
-    phi = np.asarray(problem.baseline.phi(rows, problem.layout, problem.outputs, np))
+    phi = problem.phi(rows)
     delta, gain = term(rows), problem.weight.matrix
     left, target = smoother.left(times(gain, phi)), smoother.left(times(gain, delta))
     others = complementary_parameters(problem.shared.basis)

@@ -21,7 +21,7 @@ DEFECTS: tuple[type[BaseException], ...] = (
 )
 
 
-def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise: T) -> T:
+def attempt(what: str, analysis: Callable[[], T], warnings: list[Warning], otherwise: T) -> T:
     """Return the result of an analysis, or `otherwise` with one more warning where it fails.
 
     Training may have taken hours: a defect of an analysis does not discard it, and is logged.
@@ -49,7 +49,10 @@ def attempt(what: str, analysis: Callable[[], T], warnings: list[Any], otherwise
 
 
 def attempt_warned(
-    what: str, analysis: Callable[[], T | None], warnings: list[Any], without: Warning | None = None
+    what: str,
+    analysis: Callable[[], T | None],
+    warnings: list[Warning],
+    without: Warning | None = None,
 ) -> T | None:
     """Return the result of an analysis, or `without`; its own warnings are added too.
 

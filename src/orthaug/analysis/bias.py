@@ -22,6 +22,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.lines import percent
+from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.inference.linearization import Certificate, Linearization
 
 RemovedBy = Literal["learner", "learner and measure", "learner in part", "measure", "nothing"]
@@ -336,7 +337,11 @@ def table_beside(
 
 
 def term_bias(
-    physics: TermPhysics, suspect: Any, response: TermResponse, *, certify: bool = True
+    physics: TermPhysics,
+    suspect: Suspect | MotionSuspect,
+    response: TermResponse,
+    *,
+    certify: bool = True,
 ) -> SuspectedBias:
     """Return the bias by one term, as the fit responds to it."""
     moved, share, found, cosine, certificate = response.moved, None, None, None, None

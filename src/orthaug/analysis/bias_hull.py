@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent
+from orthaug._base.lines import first_words, percent
 from orthaug.inference.covariance import interval, reach
 
 # Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
@@ -122,9 +122,7 @@ def undetermined_warning(
     names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]
 ) -> Warning:
     """Return the warning on parameters that the hull leaves open, with reason and remedy."""
-    shown = ", ".join(names[:_LISTED]) + (
-        f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    )
+    shown = first_words(names, _LISTED)
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
     causes = " and ".join(f"{c.name} ({percent(c.share)} of what it found)" for c in pair)

@@ -185,7 +185,7 @@ def _side_by_side(
     state: Float[Array, "n0"],
     resting: Float[Array, "T nu"],
     inputs: Float[Array, "T nu"],
-    steps: Any,
+    steps: Array,
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
 ) -> Bool[Array, "f"]:
@@ -195,7 +195,7 @@ def _side_by_side(
     """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
 
-    def is_unfinished(carry: tuple[Any, Any, Any]) -> Any:
+    def is_unfinished(carry: tuple[Any, Any, Any]) -> Array:
         return (carry[0] < steps) & ~carry[2].all()
 
     def step(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import percent, plain_number
+from orthaug._base.lines import first_words, percent, plain_number
 from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
 from orthaug.analysis.bias_hull import (
     LEAST,
@@ -335,7 +335,7 @@ def budget_by(
     shifts = np.array([entry.shift for entry in nameless]).reshape(-1, len(bias))
     other = np.linalg.norm(shifts, axis=0)
     candidates = _candidates(terms, found, shifts, declared)
-    std = np.full(len(bias), np.nan) if fit.std is None else fit.std
+    std = fit.known_std
     ends = hull(value, std, fit.freedom, candidates, other)
     ends = np.clip(ends, *terms.bounds.T[:, :, None])
     owners = _owners(found, np.array([causes.moved for causes in found]))
@@ -599,9 +599,8 @@ def _describe_cause(entry: SuspectedBias) -> str:
 
 def list_biases(large: Sequence[ParameterBias]) -> str:
     """Return the largest biases in words."""
-    shown = sorted(large, key=lambda entry: -(entry.errors or 0.0))[:_LISTED]
-    more = f" and {len(large) - len(shown)} more" if len(large) > len(shown) else ""
-    return f"{', '.join(map(_describe_bias, shown))}{more}"
+    ordered = sorted(large, key=lambda entry: -(entry.errors or 0.0))
+    return first_words(list(map(_describe_bias, ordered)), _LISTED)
 
 
 def _describe_bias(entry: ParameterBias) -> str:

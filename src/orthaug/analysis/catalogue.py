@@ -133,10 +133,12 @@ class Catalogue:
         pairs = [(one, other) for i, one in enumerate(used) for other in used[i:]]
         products = [f"{one}**2" if one == other else f"{one}*{other}" for one, other in pairs]
 
-        def of_kind(kind: str, on: str | None, width: float | None, place: str, name: str) -> Any:
+        def of_kind(
+            kind: str, on: str | None, width: float | None, place: str, name: str
+        ) -> Suspect:
             return Suspect.of(kind, on, width=width, output=place, name=name)
 
-        def of_text(text: str, on: str | None, place: str, name: str) -> Any:
+        def of_text(text: str, on: str | None, place: str, name: str) -> Suspect:
             own = constants if on is not None else {}
             return Suspect(name, text, place, None, own, on)
 

@@ -264,7 +264,7 @@ class Candidates:
         """
         problem = self.fit.problem
         x = lag_matrix(piece, problem.layout, record, self.first)
-        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+        phi = problem.phi(x)
         each = np.eye(len(problem.outputs))
         parts = [phi, np.broadcast_to(each, (len(x), *each.shape))]
         if not self.own:

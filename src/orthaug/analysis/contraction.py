@@ -18,7 +18,6 @@ from orthaug.analysis.feedback import MOST_WORK, Feedback, feedback, linearise_p
 from orthaug.analysis.visited import RunPoint, even_indices
 from orthaug.data.record import Record
 from orthaug.models.model import Model
-from orthaug.models.response import Response
 
 _SAMPLES = 2000  # points at most
 # Points of largest radius always among them; worst points that a round of search adds
@@ -52,7 +51,6 @@ def contraction(
     *,
     box: int = 0,
     along: Feedback | None = None,
-    response: Response | None = None,
 ) -> Contraction | None:
     """Return a quadratic norm in which the free run contracts on as many points as possible.
 
@@ -67,13 +65,12 @@ def contraction(
     Args:
         box: how many points to add, uniform in the box of the states and inputs that the run met.
         along: a result of `feedback`, computed if it is not given.
-        response: the model's free run of the record, if it is there already.
 
     Raises:
         InputError: as `feedback`, or a `box` that is no number of points.
     """
     box = check_count(box, "box", 0)
-    run = feedback(model, record, response=response) if along is None else along
+    run = feedback(model, record) if along is None else along
     if not run or not run.worst:
         return None
     unit, most = run.unit, min(_SAMPLES, int(MOST_WORK / len(run.unit) ** 3))

@@ -73,7 +73,6 @@ _LEVEL = 0.01  # of the test of missing terms
 _SIZABLE = 0.02
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
-_MOST_ROWS = 20_000  # at which the error is set beside states
 _UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
 
 
@@ -123,7 +122,7 @@ def _states(fit: MotionEstimate) -> list[Matrix]:
     record = fit.problem.record
     if fit.model.coloured:
         numbers = fit.model.numbers
-        c = np.asarray(numbers.theta - numbers.theta_aux)
+        c = np.asarray(numbers.c)
         return fit.segmented.states_by_row(c, numbers.weights, fit.states)
     frame = fit.model.states(record)
     ends = np.cumsum([len(e) for e in record.experiments])[:-1]
@@ -148,7 +147,7 @@ def _of_motion(
         return None
     if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
         return None
-    errors, every = errors_of(free_run), -(-len(record) // _MOST_ROWS)
+    errors = errors_of(free_run)
     firsts = [run.start for run in free_run.trajectories]
     inputs = [e.inputs[first:] for e, first in zip(record.experiments, firsts, strict=True)]
     states = [own[first:] for own, first in zip(_states(fit), firsts, strict=True)]
@@ -157,7 +156,7 @@ def _of_motion(
     names = ([c.name for c in record.outputs], list(motion.external), list(motion.names_of_states))
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
-        shares = tuple(_predictable(i, test, errors, inputs, every) for i, test in enumerate(tests))
+        shares = tuple(_predictable(i, test, errors, inputs) for i, test in enumerate(tests))
         missing = missing_terms(fit)
     if any(test.white is None for test in tests):
         return None
@@ -200,7 +199,9 @@ def _late_inputs(fit: MotionEstimate) -> tuple[LateInput, ...]:
     return find_late_inputs(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
 
 
-def _predictable(i: int, test: ResidualTest, errors: list, inputs: list, every: int) -> Predictable:
+def _predictable(
+    i: int, test: ResidualTest, errors: list[Matrix], inputs: list[Matrix]
+) -> Predictable:
     """Return the predictable shares of an output's error.
 
     Its own past, lagged inputs and functions of states predict it.

@@ -31,7 +31,7 @@ from orthaug.models.learners import Learner, declared
 from orthaug.models.rows import InMemory
 from orthaug.models.tasks import runs_on
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.problem import Problem
+from orthaug.physics.problem import PosedProblem, Problem
 
 DEFAULT_BLOCKS = 4
 """Blocks of cross-validation where no part is held out."""
@@ -141,7 +141,7 @@ class Evidence:
         return "direct" if self.criterion.free_run is None else "free run"
 
 
-def sample_warnings(problem: Any) -> list[Warning]:
+def sample_warnings(problem: PosedProblem) -> list[Warning]:
     """Return warnings on training samples that are no measurements.
 
     Of physics that is linear in θ they say what a fit without them gives.

@@ -12,6 +12,7 @@ import numpy as np
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
+from orthaug.analysis.budget import Budget
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
@@ -32,7 +33,9 @@ from orthaug.analysis.validation import (
 )
 from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import fit as train
+from orthaug.fitting.status import Status
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.inference.over_experiments import differing_warning
 from orthaug.models.response import Response
@@ -53,8 +56,7 @@ _FINDINGS = (
 class Examination:
     """A fit with the standard errors that its residual calls for, and what was found on it."""
 
-    fit: Any
-    """The `Estimate`."""
+    fit: Estimate
     evidence: Evidence
     result: Findings
     responses: Mapping[str, tuple[Response, Response]]
@@ -71,15 +73,15 @@ class Examination:
 E = TypeVar("E", bound=Examination)
 
 
-def examine(fit: Any, evidence: Evidence) -> Examination:
+def examine(fit: Estimate, evidence: Evidence) -> Examination:
     """Return everything that is found on a fit: scores, verdict on the learner, doubts."""
     return doubt(with_verdict(score_and_analyse(fit, evidence)))
 
 
-def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
+def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     """Return a fit scored on every part, with the findings on it but verdict and doubts."""
     Stage.SCORES.enter()
-    warnings: list[Any] = [*evidence.warnings, *fit.warnings]
+    warnings: list[Warning] = [*evidence.warnings, *fit.warnings]
     scores, responses = {}, {}
     if fit.status.ok:
         for part in evidence.parts:
@@ -117,10 +119,10 @@ def score_and_analyse(fit: Any, evidence: Evidence) -> Examination:
 
 
 def _analyse(
-    fit: Any,
+    fit: Estimate,
     evidence: Evidence,
     responses: Mapping[str, tuple[Response, Response]],
-    warnings: list[Any],
+    warnings: list[Warning],
 ) -> tuple[Any, dict[str, Any]]:
     """Return the fit with its standard errors, and the findings of its analyses.
 
@@ -162,7 +164,7 @@ def _analyse(
     }
 
 
-def _parameters(fit: Any) -> list[ParameterResult]:
+def _parameters(fit: Estimate) -> list[ParameterResult]:
     """Return the parameters as results list them; without values where training failed."""
     problem = fit.problem
     values = fit.values if fit.status.ok else np.full(len(problem.names), np.nan)
@@ -179,7 +181,7 @@ def _parameters(fit: Any) -> list[ParameterResult]:
 def _with_biases(
     rows: Sequence[ParameterResult],
     determined: Sequence[str] | None,
-    budget: Any,
+    budget: Budget | None,
     held: Collection[str] = (),
 ) -> list[ParameterResult]:
     """Return the parameters, with whether the learner could imitate them and what biases them.
@@ -197,7 +199,7 @@ def _with_biases(
     ]
 
 
-def _of_learner(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict[str, Any]:
+def _of_learner(fit: Estimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
     """Return intervals over experiments, and the equations of a learner of terms."""
     over = attempt(
         "the errors over experiments",
@@ -249,7 +251,9 @@ def _unexplained_warnings(fitted: Examination, physics: Callable[[], Any] | None
     return [Warning("unexplained", text)]
 
 
-def _over_experiments(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict[str, Any] | None:
+def _over_experiments(
+    fit: Any, evidence: Evidence, warnings: list[Warning]
+) -> dict[str, Any] | None:
     """Return intervals for experiments like those fitted; None where these are too few.
 
     A warning is added where they differ by more than the fit's own intervals allow.
@@ -280,7 +284,7 @@ def _over_experiments(fit: Any, evidence: Evidence, warnings: list[Any]) -> dict
     return content
 
 
-def _status(fit: Any, warnings: Sequence[Any]) -> Any:
+def _status(fit: Estimate, warnings: Sequence[Warning]) -> Status:
     """Return how training ended.
 
     For a model whose free run diverges, the message begins with that.
@@ -328,7 +332,7 @@ def _one_step_only(
     return [Warning("one_step_only", text)]
 
 
-def _for_observers(fit: Any, verdict: str, warnings: list[Any]) -> Any:
+def _for_observers(fit: Estimate, verdict: str, warnings: list[Warning]) -> Estimate:
     """Return the fit with a model that keeps what observers need.
 
     These are the verdict on the residual, and the two noises.
@@ -349,7 +353,7 @@ def with_verdict(made: E) -> E:
     if not fit.status.ok or not (learns or fit.held_out is not None):
         return made
     Stage.VERDICT.enter()
-    failed: list[Any] = []
+    failed: list[Warning] = []
     physics = cache(partial(_physics_alone, fit))
     verdict = attempt(
         "the judgement of the learner",
@@ -374,7 +378,7 @@ def with_verdict(made: E) -> E:
     return replace(made, result=made.result.changed(validation=verdict, warnings=warnings))
 
 
-def _physics_alone(fit: Any) -> Any:
+def _physics_alone(fit: Estimate) -> Estimate:
     """Return the fit of physics alone that the learner is compared to.
 
     It is the one that was made already, or one by the same criterion.
@@ -438,7 +442,7 @@ def judge_fit(
     return judge(trials, beyond)
 
 
-def was_stopped(fit: Any) -> bool:
+def was_stopped(fit: Estimate) -> bool:
     """Return whether training was asked to end early: then cross-validation is omitted too."""
     return any(warning.code == "stopped" for warning in fit.warnings)
 

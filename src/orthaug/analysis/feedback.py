@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice
+from orthaug._base.checks import Vector, positive
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.visited import (
     MOST_STEPS,
     RunPoint,
     RunPoints,
-    positive,
     sample_free_run,
-    sample_measured,
 )
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -66,7 +64,7 @@ def difference_width(points: Float[np.ndarray, "m n"]) -> Vector:
     return _WIDTH * positive(points.std(axis=0))
 
 
-def by_differences(function: Any, point: Any, width: Any) -> Any:
+def by_differences(function: Any, point: Array, width: Array) -> Array:
     """Return ∂function/∂point (outputs, n) from differences of `width` (n,)."""
     aside, each = jnp.diag(width), jax.vmap(function)
     return ((each(point + aside) - each(point - aside)) / (2 * width[:, None])).T
@@ -78,12 +76,12 @@ def _transitions(
     numbers: Numbers,
     states: Float[Array, "m n0"],
     inputs: Float[Array, "m nu"],
-    width: Any,
+    width: Array,
 ) -> Float[Array, "m n0 n0"]:
     """Return A_k at m points, by differences where a learner has no derivative."""
 
-    def at(state: Any, row: Any) -> Any:
-        def next_state(state: Any) -> Any:
+    def at(state: Array, row: Array) -> Array:
+        def next_state(state: Array) -> Array:
             return form.step(numbers, state, row)[0]
 
         return (
@@ -118,33 +116,25 @@ class Feedback:
     diverged: tuple[str, ...]
 
 
-def feedback(
-    model: Model, record: Record, *, along: str = "simulation", response: Response | None = None
-) -> Feedback | None:
-    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along a run; None without a state.
+def feedback(model: Model, record: Record, *, response: Response | None = None) -> Feedback | None:
+    """Return A_k = ∂x_{k+1}/∂x_k and its spectral radius along the free run.
 
-    At most 20000 steps, spread evenly: fewer where the state is large, none where n0 is above 200.
+    None without a state. At most 20000 steps up to where it diverges, spread evenly: fewer where
+    the state is large, none where n0 is above 200.
     Radii below 1 do not make a nonlinear run stable, nor do some above 1 make it unstable. They say
     where to look.
 
     Args:
-        along: "simulation", states of the free run up to where it diverges, or "measured", as the
-            outputs give them.
         response: the model's free run of the record, if it is there already.
 
     Raises:
-        InputError: a record that does not fit the model, or another `along`.
+        InputError: a record that does not fit the model.
     """
-    check_choice(along, ("simulation", "measured"), "`along`")
     if not (size := model.form.states):
         return None
     most = 0 if size > _LONGEST_STATE else min(MOST_STEPS, int(MOST_WORK / size**3))
-    if along == "simulation":
-        run = sample_free_run(
-            model, record, model.simulate(record) if response is None else response, most
-        )
-    else:
-        run = sample_measured(model, record, most)
+    response = model.simulate(record) if response is None else response
+    run = sample_free_run(model, record, response, most)
     points, transition, radius = linearise_points(model, run.points)
     largest, worst = points.worst(record, radius, model.form.describe)
     median, share = (

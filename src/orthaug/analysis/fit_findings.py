@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, PrivateAttr
 
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.content import ByName, Content, Flag, Number, Numbers, Whole
 from orthaug._base.errors import Warning
 from orthaug._base.views import MAKERS
@@ -326,11 +327,11 @@ class Findings(Content):
 
 def parameter_rows(
     parameters: Sequence[Parameter | PhysicalParameter],
-    values: Any,
-    std: Any = None,
-    interval: Any = None,
+    values: Vector,
+    std: Vector | None = None,
+    interval: Matrix | None = None,
     one_step: Any = None,
-    plain_std: Any = None,
+    plain_std: Vector | None = None,
 ) -> list[ParameterResult]:
     """Return θ as results list it; a parameter at a bound has no interval."""
     return [

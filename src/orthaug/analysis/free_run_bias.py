@@ -268,8 +268,7 @@ class MotionTerms:
         fit = self.fit
         if fit is None or self.learned is None or (fit.split_by.share or 0.0) >= _NOTHING:
             return False
-        std = np.full(len(bias), np.nan) if fit.std is None else fit.std
-        return not np.any(np.abs(bias) > _UNMOVED * std)
+        return not np.any(np.abs(bias) > _UNMOVED * fit.known_std)
 
     def noise_share(self) -> float:
         """Return ν, the share of noise in the learner, by the band of the learned curve."""
@@ -373,7 +372,7 @@ def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
         return None
     numbers, field, learned = fit.model.numbers, fit.split_by.field, None
     ridge = fit.model.statistics.ridge / fit.scores.unit
-    c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
+    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
     place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
     if fit.learns:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.lines import join_words
 from orthaug.analysis.mapped_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
 from orthaug.data.regressors import Features
@@ -84,7 +85,7 @@ class Imitation:
     @property
     def text(self) -> str:
         """In sentences."""
-        sees = f"The learner sees {_list_words(self.inputs)}"
+        sees = f"The learner sees {join_words(self.inputs)}"
         if self.terms:
             sees = f"The learner is a sum of {len(self.inputs)} terms"
         if self.everything:
@@ -95,14 +96,14 @@ class Imitation:
         if self.held:
             are, them = ("is", "it") if len(self.held) == 1 else ("are", "them")
             sees = (
-                f"{_list_words(self.held)} {are} at a bound: the orthogonal split does not move "
+                f"{join_words(self.held)} {are} at a bound: the orthogonal split does not move "
                 f"{them}. {sees}"
             )
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
             return f"{text}: the data determine every{rest} parameter{_PROVIDED}.{self._nearly}"
-        could = _list_words([_combination(direction) for direction in self.directions])
+        could = join_words([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
             f"{sees} and could imitate {could}. Along {along} the data alone do not determine "
@@ -110,12 +111,12 @@ class Imitation:
         ]
         if self.determined:
             sentences.append(
-                f"The data determine {_list_words(self.determined)} "
+                f"The data determine {join_words(self.determined)} "
                 "with any learner of these inputs."
             )
         if self.physical:
             sentences.append(
-                f"Of the physical parameters they determine {_list_words(self.physical)}."
+                f"Of the physical parameters they determine {join_words(self.physical)}."
             )
         return " ".join(sentences) + self._nearly
 
@@ -189,7 +190,7 @@ class MotionImitation(Imitation):
         if not self.remembered:
             return ""
         state = "state" if len(self.memory) == 1 else "states"
-        names = _list_words(self.remembered)
+        names = join_words(self.remembered)
         return (
             f" With its own {state} {', '.join(self.memory)} it could also imitate {names}, by the "
             f"past of its inputs. The interval of {names} holds for the solution that was found: "
@@ -301,16 +302,6 @@ def _combination(direction: dict[str, float]) -> str:
         sign = ("-" if factor < 0 else "") if not text else (" - " if factor < 0 else " + ")
         text += f"{sign}{size}{name}"
     return text
-
-
-def _list_words(words: tuple[str, ...] | list[str]) -> str:
-    return (
-        words[0]
-        if len(words) == 1
-        else f"{', '.join(words[:-1])} and {words[-1]}"
-        if words
-        else "nothing"
-    )
 
 
 def imitation_before(

@@ -72,7 +72,7 @@ def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl np"], Float[Array, "m nl n"]]:
     """Return the derivatives of the learner's part by p̂, and by (c, w)."""
-    c = numbers.theta - numbers.theta_aux
+    c = numbers.c
 
     def at(x: Any, u: Any) -> Any:
         def part(q: Any, c: Any, w: Any) -> Any:

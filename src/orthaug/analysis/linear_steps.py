@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Vector, positive
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.feedback import by_differences
 from orthaug.models.dynamics import Numbers
@@ -67,21 +67,21 @@ class LaggedStep:
         """Names of the inputs."""
         return self.memory.inputs
 
-    def state_at(self, rest: Any, inputs: Any) -> Any:
+    def state_at(self, rest: Array, inputs: Array) -> Array:
         """Return the state that keeps outputs `rest` and inputs for long."""
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
         return jnp.stack([now[lag.channel] for lag in self.memory.lags] or [jnp.zeros(())])[
             : len(self.memory.lags)
         ]
 
-    def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+    def advance(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Any]:
         """Return the next state and the outputs."""
         following, parts = LaggedFilter(self.form, self.memory).step(numbers, state, inputs)
         return following, parts.total
 
     field = advance  # there are no equations in time
 
-    def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
+    def unrest(self, numbers: Numbers, rest: Array, inputs: Array) -> tuple[Any, Any]:
         """Return the residual of rest, zero at rest, and the outputs."""
         y = self.advance(numbers, self.state_at(rest, inputs), inputs)[1]
         return y - rest, y
@@ -144,15 +144,15 @@ class MotionStep:
     def inputs(self) -> tuple[str, ...]:
         return self.form.motion.external
 
-    def state_at(self, rest: Any, inputs: Any) -> Any:
+    def state_at(self, rest: Array, inputs: Array) -> Array:
         """Return the state itself."""
         return jnp.asarray(rest)
 
-    def advance(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+    def advance(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Any]:
         following, parts = self.form.step(numbers, state, inputs)
         return following, parts.total
 
-    def field(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any]:
+    def field(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Any]:
         """Return the derivatives in time, or a discrete motion's next state, and the outputs.
 
         With a controller the motion is known at samples only.
@@ -163,7 +163,7 @@ class MotionStep:
             numbers, state, inputs
         )
 
-    def unrest(self, numbers: Numbers, rest: Any, inputs: Any) -> tuple[Any, Any]:
+    def unrest(self, numbers: Numbers, rest: Array, inputs: Array) -> tuple[Any, Any]:
         rates, y = self.field(numbers, rest, inputs)
         return (rates if self.continuous else rates - rest), y
 
@@ -191,13 +191,12 @@ def step_of(model: Model) -> Step:
 
 def sizes_of(model: Model) -> Vector:
     """Return the sizes of the unknowns of rest over the training data."""
-    size = step_of(model).sizes(model)
-    return np.where(np.isfinite(size) & (size > 0), size, 1.0)
+    return positive(step_of(model).sizes(model))
 
 
 @partial(quick_jit, static_argnames="step")
 def at_rest(
-    step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any
+    step: Step, numbers: Numbers, rest: Array, inputs: Array, width: Array
 ) -> tuple[Any, Any, Any]:
     """Return residual of rest (ne,), outputs (ny,), and slopes of both (ne + ny, ne + nu).
 
@@ -212,12 +211,12 @@ def at_rest(
     return value[:ne], value[ne:], slope
 
 
-def _unrest(step: Step, numbers: Numbers, point: Any) -> Any:
+def _unrest(step: Step, numbers: Numbers, point: Array) -> Array:
     rest, inputs = point[: len(step.rest)], point[len(step.rest) :]
     return jnp.concatenate(step.unrest(numbers, rest, inputs))
 
 
-def _replace_unknowns(numbers: Numbers, unknowns: Any) -> Numbers:
+def _replace_unknowns(numbers: Numbers, unknowns: Array) -> Numbers:
     """Return the numbers with others for (θ, weights), or for θ alone."""
     nt = len(numbers.theta)
     weights = unknowns[nt:] if len(unknowns) > nt else numbers.weights
@@ -226,11 +225,11 @@ def _replace_unknowns(numbers: Numbers, unknowns: Any) -> Numbers:
 
 @partial(quick_jit, static_argnames="step")
 def unrest_along(
-    step: Step, numbers: Numbers, rest: Any, inputs: Any, unknowns: Any, root: Any
+    step: Step, numbers: Numbers, rest: Array, inputs: Array, unknowns: Array, root: Array
 ) -> Float[Array, "m r"]:
     """Return the change of rest's residual and of the outputs along columns of `root` (n, r)."""
 
-    def of(p: Any) -> Any:
+    def of(p: Array) -> Any:
         return _unrest(step, _replace_unknowns(numbers, p), jnp.concatenate([rest, inputs]))
 
     return jax.vmap(lambda d: jax.jvp(of, (unknowns,), (d,))[1], -1, -1)(root)
@@ -243,12 +242,12 @@ def _of_point(step: Step, field: bool, numbers: Numbers) -> Callable[[Any], Any]
     return lambda point: jnp.concatenate(function(numbers, point[:n], point[n:]))
 
 
-def _build_rows(step: Step, field: bool, rest: Any, inputs: Any) -> Any:
+def _build_rows(step: Step, field: bool, rest: Array, inputs: Array) -> Array:
     """Return state and inputs of a step in one vector; of the field the inputs at one instant."""
     return jnp.concatenate([step.state_at(rest, inputs), *([inputs] * (1 if field else step.ends))])
 
 
-def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> Any:
+def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Array, width: Any) -> Any:
     """Return `[[A, B], [C, D]]` of a step, or of the field."""
     both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
     if step.form.differentiable:
@@ -259,7 +258,9 @@ def _slope(step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, wi
 
 
 @partial(quick_jit, static_argnames="step")
-def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) -> tuple[Any, Any]:
+def one_sided(
+    step: Step, numbers: Numbers, rest: Array, inputs: Array, width: Array
+) -> tuple[Any, Any]:
     """Return `[A B]` by differences to each side, (2, n, k), and their reach, (k,)."""
     both, point = _of_point(step, False, numbers), _build_rows(step, False, rest, inputs)
     full = _build_rows(step, False, width[: len(rest)], width[len(rest) :])
@@ -272,7 +273,7 @@ def one_sided(step: Step, numbers: Numbers, rest: Any, inputs: Any, width: Any) 
 
 @partial(quick_jit, static_argnames=("step", "field"))
 def slope_at(
-    step: Step, field: bool, numbers: Numbers, rest: Any, inputs: Any, width: Any
+    step: Step, field: bool, numbers: Numbers, rest: Array, inputs: Array, width: Array
 ) -> Float[Array, "m n"]:
     """Return `[[A, B], [C, D]]` at a point of rest."""
     return _slope(step, field, numbers, rest, inputs, width)
@@ -283,9 +284,9 @@ def slope_along(
     step: Step,
     field: bool,
     numbers: Numbers,
-    rest: Any,
-    inputs: Any,
-    unknowns: Any,
+    rest: Array,
+    inputs: Array,
+    unknowns: Array,
     along: tuple[Any, Any, Any],
 ) -> Float[Array, "r m n"]:
     """Return the change of `[[A, B], [C, D]]` along each column of `along`.
@@ -293,7 +294,7 @@ def slope_along(
     The columns are directions of (rest, inputs, unknowns).
     """
 
-    def of(rest: Any, inputs: Any, p: Any) -> Any:
+    def of(rest: Array, inputs: Array, p: Array) -> Any:
         return _slope(step, field, _replace_unknowns(numbers, p), rest, inputs, None)
 
     point = (rest, inputs, unknowns)

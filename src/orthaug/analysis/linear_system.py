@@ -193,7 +193,7 @@ def _core(a: Matrix) -> tuple[Matrix, Matrix]:
     return core, basis
 
 
-def _right(a: Matrix, value: complex, start: Any) -> Any:
+def _right(a: Matrix, value: complex, start: np.ndarray) -> np.ndarray:
     """Return the right eigenvector of a pole, by inverse iteration."""
     shifted = a - value * (1 + 1e-12) * np.eye(len(a))
     for _ in range(2):
@@ -201,7 +201,7 @@ def _right(a: Matrix, value: complex, start: Any) -> Any:
     return start / np.linalg.norm(start)
 
 
-def _solve(left: Any, right: Any) -> Any:
+def _solve(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return `left⁻¹ right`; NaN at a pole."""
     if not left.shape[-1]:
         return np.zeros(right.shape, dtype=complex)

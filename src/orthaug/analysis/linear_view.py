@@ -224,7 +224,9 @@ class LinearView:
         )
 
 
-def log_intervals(value: Any, relative: Any, freedom: float) -> Any:
+def log_intervals(
+    value: np.ndarray | float, relative: np.ndarray | float, freedom: float
+) -> np.ndarray:
     """Return intervals (…, 2) of positive values whose logarithms are normal."""
     with np.errstate(all="ignore"):
         times = np.exp(reach(freedom) * relative)
@@ -293,7 +295,9 @@ def _match_poles(z: Any, own: System, step: float) -> list[tuple[complex, Any]]:
     return [(complex(values[j]), moved[j]) for _, j in sorted(zip(rows, columns, strict=True))]
 
 
-def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedom: float) -> Pole:
+def _pole(
+    z: complex, relative: Any, s: complex, moved: np.ndarray | None, exact: bool, freedom: float
+) -> Pole:
     """Return a pole with `relative` = δz/z and `moved` = δs along the covariance."""
     size = lambda part: float(np.sqrt(np.sum(part**2)))  # noqa: E731
     magnitude = float(abs(z))
@@ -330,7 +334,7 @@ def _pole(z: complex, relative: Any, s: complex, moved: Any, exact: bool, freedo
     )
 
 
-def _pair(ends: Any) -> Interval:
+def _pair(ends: Vector) -> Interval:
     return (float(ends[0]), float(ends[1])) if np.isfinite(ends).all() else None
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Vector, check_choice, check_type
+from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.linear_steps import (
@@ -20,7 +20,7 @@ from orthaug.analysis.linear_steps import (
     unrest_along,
 )
 from orthaug.analysis.linear_system import METHODS, Continuous, System, convert_to_continuous
-from orthaug.analysis.linear_view import Linearization, LinearView, bode_of, gain_of, poles_of
+from orthaug.analysis.linear_view import Bode, Linearization, LinearView, bode_of, gain_of, poles_of
 from orthaug.analysis.measured_response import measured_response
 from orthaug.analysis.operating_points import OperatingPoint, Search, operating_points, parse_point
 from orthaug.data.record import Record
@@ -137,7 +137,7 @@ def _frequencies(given: Any, step: float) -> Vector | None:
     return found
 
 
-def _spread(model: Model, fit: Any) -> tuple[_Spread | None, list[Warning]]:
+def _spread(model: Model, fit: Estimate | None) -> tuple[_Spread | None, list[Warning]]:
     """Return the covariance to take intervals from, and what is to be said of it."""
     joint, nt = model.statistics.joint(len(model.theta)), len(model.theta)
     if not model.form.differentiable:
@@ -206,8 +206,7 @@ def _view(
         grid = _grid(poles, model.sampling_time) if frequency is None else frequency
         bode = bode_of(own if smooth and own is not None else sampled, grid, freedom)
         warnings += _rough(bode)
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-    units |= step.units
+    units = model.units | step.units
     outputs = tuple(channel.name for channel in model.outputs)
     modes = sampled.modes.at_zero
     seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)
@@ -251,7 +250,7 @@ def _system(
 def _without_next(system: System) -> System:
     """Return the system without inputs of the next sample: `z = x − B₁ u` (first-order hold)."""
 
-    def rewritten(matrix: Any, moved: Any = None) -> Any:
+    def rewritten(matrix: Matrix, moved: Matrix | None = None) -> Matrix:
         """Return the matrices, or their change `moved`, in the new state."""
         n = system.states
         nu = (matrix.shape[1] - n) // 2
@@ -307,7 +306,7 @@ def _grid(poles: Any, step: float) -> Vector:
     return np.geomspace(max(lowest, _LOWEST * nyquist), nyquist, _POINTS)
 
 
-def _rough(bode: Any) -> list[Warning]:
+def _rough(bode: Bode) -> list[Warning]:
     if bode.magnitude_ci95 is None:
         return []
     with np.errstate(all="ignore"):

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, positive
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.analysis.feedback import by_differences, difference_width
-from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, even_indices, positive, usable
+from orthaug.analysis.visited import MOST_STEPS, RowIndex, RunPoint, even_indices, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
@@ -88,7 +88,7 @@ def lipschitz(model: Model, record: Record, *, x: Matrix | None = None) -> Lipsc
     size = partial(np.linalg.norm, axis=(1, 2))
     largest = []
     with np.errstate(all="ignore"):
-        phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
+        phi = np.asarray(form.phi(x, np))
         rms = np.sqrt(np.mean(np.sum((phi / y_scale[:, None]) ** 2, axis=1), axis=0))
         scales = (y_scale, np.outer(y_scale, positive(rms)).ravel())
         sizes = []
@@ -141,15 +141,15 @@ def _gradients(form: LaggedDynamics, numbers: Numbers, x: Matrix) -> Iterator[li
 
 @partial(quick_jit, static_argnames="form")
 def _gradient_rows(
-    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Any
+    form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"], width: Array
 ) -> tuple[Array, Array]:
     """Return ∂g/∂x (m, ny, nx) and ∂φ/∂x, by differences of `width` (nx,) without a derivative."""
 
-    def g(row: Any) -> Any:
+    def g(row: Array) -> Array:
         return form.at(numbers, row).total
 
     def phi(row: Any) -> Any:
-        return form.baseline.phi(row, form.layout, form.outputs, jnp)
+        return form.phi(row)
 
     slope = jax.jacrev(g) if form.differentiable else partial(by_differences, g, width=width)
     return jax.vmap(slope)(x), jax.vmap(jax.jacfwd(phi))(x)
@@ -183,7 +183,7 @@ def _weight_squares(
 ) -> Float[Array, "m ny"]:
     """Return Σ_w (∂²g/∂w∂x)² along one direction of x."""
 
-    def slopes(row: Any) -> Any:
+    def slopes(row: Array) -> Array:
         return jax.jacrev(lambda w: form.at(numbers._replace(weights=w), row).total)(
             numbers.weights
         )

@@ -29,11 +29,9 @@ def physical_slopes(
     return dict(zip(physics.names, rows, strict=True)), p
 
 
-def physical_of(
-    physics: PhysicsMap, problem: Problem, theta: Vector, covariance: Matrix | None = None
-) -> Vector:
-    """Return p of θ, weighted by its covariance where that is given."""
-    return _solve_physical(physics, problem, theta, covariance).value
+def physical_of(physics: PhysicsMap, problem: Problem, theta: Vector) -> Vector:
+    """Return p of θ."""
+    return _solve_physical(physics, problem, theta, None).value
 
 
 def _solve_physical(

@@ -118,7 +118,7 @@ def lag_tests(problem: Problem, residual: Matrix, hidden: Sequence[int]) -> tupl
     x, gain = problem.rows.x[smoother.every], problem.weight.matrix
     e = smoother.left(times(gain, residual[smoother.every]))
     rows, ny = e.shape
-    phi = times(gain, np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np)))
+    phi = times(gain, problem.phi(x))
     phi = phi / np.maximum(np.sqrt(np.sum(phi**2, axis=(0, 1))), np.finfo(float).tiny)
     physics = _orthonormal(smoother.left(phi).reshape(rows * ny, phi.shape[2]), 1.0)
     e = _project_out(physics, e.reshape(-1)).reshape(rows, ny)

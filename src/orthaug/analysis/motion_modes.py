@@ -80,20 +80,14 @@ def motion_stability(
         return checks
     factor = divergence_scaling(model, record, _LARGEST)
     sentence, code = margin(factor, _LARGEST, driven=True)
-    radius = radius_beyond(model, x, _of_steps(model, record))
+    inputs = [model.form.inputs(experiment, record) for experiment in record.experiments]
+    radius = radius_beyond(model, x, np.concatenate(inputs))
     text = "\n".join(
         part for part in (checks.text, sentence, describe_beyond(model, radius)) if part
     )
     warnings = (*checks.warnings, *((Warning(code, sentence),) if code else ()))
     found = {"diverges_at": factor, "searched": _LARGEST, "radius_beyond": radius}
     return replace(checks, text=text, warnings=warnings, **found)
-
-
-def _of_steps(model: Model[MotionDynamics], record: Record) -> Matrix:
-    """Return the inputs of the steps of a record, (T, nu)."""
-    return np.concatenate(
-        [model.form.inputs(experiment, record) for experiment in record.experiments]
-    )
 
 
 def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStability:

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -54,7 +53,7 @@ class FreeRunPoint:
     segmented: SegmentedMotion
     c: Vector
     w: Vector
-    states: Any
+    states: np.ndarray
     weight: Matrix
     """(ny, ny), multiplies errors."""
     ridge: float | Vector = 0.0
@@ -76,7 +75,7 @@ class TermsResponse:
     numbers: Numbers
     information: Matrix
     gradient: Vector
-    slope: Any
+    slope: np.ndarray | None
     fitted: Bool[np.ndarray, "n"]
     terms: int
     segments: Segments
@@ -241,7 +240,7 @@ def _learned_change(
     x: Float[Array, "m nx"],
     u: Float[Array, "m nu"],
 ) -> Float[Array, "m nl"]:
-    def learned_output(w: Any) -> Any:
+    def learned_output(w: Array) -> Array:
         return jax.vmap(lambda x, u: form.learned(numbers._replace(weights=w), x, u))(x, u)
 
     return jax.jvp(learned_output, (jnp.asarray(numbers.weights),), (jnp.asarray(dw),))[1]
@@ -284,7 +283,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         or 2 * substeps > MOST_SUBSTEPS
     ):
         return None
-    c, w = np.asarray(numbers.theta - numbers.theta_aux), np.asarray(numbers.weights)
+    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
     finer = segmented.with_substeps(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
     moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
@@ -304,8 +303,7 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     step = np.zeros(len(free))
     step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
     value = motion.coordinates.slopes(fit.theta) * (slope @ step)
-    std = np.full(len(c), np.nan) if fit.std is None else fit.std
-    errors = np.abs(value) / np.where(std > 0, std, np.nan)
+    errors = np.abs(value) / np.where(fit.known_std > 0, fit.known_std, np.nan)
     found = SubstepBias(motion.names, substeps, value, errors)
     return replace(found, warnings=_warnings(found, fit))
 

@@ -59,7 +59,7 @@ class ObserverRun:
     start_time: float
 
     @property
-    def count(self) -> Any:
+    def count(self) -> np.ndarray:
         return np.isfinite(self.measured).sum(axis=1)
 
     @property

@@ -8,12 +8,12 @@ variance: that is for a model that is not exact. Otherwise both are there.
 
 from __future__ import annotations
 
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 import scipy.optimize
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.data.record import Record
@@ -132,12 +132,12 @@ def most_likely(model: Model, begun: Noise, record: Record, rows: int = _TUNED_R
             break
     free = [bool(part.any()) for part in begun]
 
-    def noise(exponents: Any) -> Noise:
+    def noise(exponents: Vector) -> Noise:
         factor = np.ones(2)
         factor[free] = np.exp(np.clip(exponents, -_REACH, _REACH))
         return Noise(factor[0] * begun.state, factor[1] * begun.output)
 
-    def cost(exponents: Any) -> float:
+    def cost(exponents: Vector) -> float:
         tried = noise(exponents)
         value = -sum(log_likelihood(form, numbers, tried, *stretch) for stretch in stretches)
         return value if np.isfinite(value) else _LARGE

@@ -218,7 +218,7 @@ def operating_points(search: Search) -> tuple[list[OperatingPoint], list[Warning
             continue
         found.append(one)
     if not found:
-        raise InputError(_reason_for_none(search, starts, unit))
+        raise InputError(_reason_for_none(search, starts))
     found.sort(
         key=lambda one: float(np.linalg.norm((_join_unknowns(one) - search.middle) / search.scale))
     )
@@ -266,7 +266,7 @@ def _solve_rest(search: Search, start: Vector, unit: Vector) -> Vector | None:
 
     free, point = search.free, start.copy()
 
-    def at(values: Any) -> tuple[Any, Any]:
+    def at(values: Vector) -> tuple[Any, Any]:
         point[free] = start[free] + values * search.scale[free]
         value, slope, _ = search.equations(point)
         return value / unit, slope[:, free] / unit[:, None] * search.scale[free]
@@ -310,7 +310,7 @@ def _point(search: Search, point: Vector) -> OperatingPoint:
     )
 
 
-def _reason_for_none(search: Search, starts: Matrix, unit: Vector) -> str:
+def _reason_for_none(search: Search, starts: Matrix) -> str:
     """Return the reason why there is no point."""
     names = (*search.step.rest, *search.step.inputs)
     fixed = [

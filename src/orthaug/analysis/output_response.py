@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp, padded_length, quick_jit
+from orthaug._base.jax import Array, jax, jnp, padded_length, quick_jit
 from orthaug.data.record import Record
 from orthaug.fitting.whiteness import LARGEST
+from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
 
 
@@ -97,7 +98,7 @@ def linear_runs(model: Model, record: Record, most: int, theta: Vector) -> list[
 
 
 def _linearize(
-    form: Any, numbers: Any, start: Any, rows: Matrix, outputs: Matrix, inputs: Matrix
+    form: Dynamics, numbers: Numbers, start: Vector, rows: Matrix, outputs: Matrix, inputs: Matrix
 ) -> LinearRun | None:
     count = len(rows)
     padded = np.pad(rows, ((0, padded_length(count) - count), (0, 0)), mode="edge")
@@ -114,18 +115,18 @@ def _linearize(
 
 
 @partial(quick_jit, static_argnames="form")
-def _linearise_run(form: Any, numbers: Any, start: Any, rows: Any) -> Any:
+def _linearise_run(form: Dynamics, numbers: Numbers, start: Array, rows: Array) -> Any:
     """Return states, outputs, and the slopes of both, at every row of a free run.
 
     The slopes are those by state and parameters.
     """
 
-    def step(state: Any, theta: Any, row: Any) -> tuple[Any, Any]:
+    def step(state: Array, theta: Array, row: Array) -> tuple[Any, Any]:
         own = form.prepare(numbers._replace(theta=theta))
         following, parts = form.step(own, state, row)
         return following, parts.total
 
-    def advance(state: Any, row: Any) -> tuple[Any, Any]:
+    def advance(state: Array, row: Array) -> tuple[Any, Any]:
         following, output = step(state, theta, row)
         return following, (state, output)
 

@@ -66,7 +66,11 @@ def describe_physics(fit: Estimate) -> dict[str, Any]:
 
 
 def analyse_physics(
-    fit: Estimate, evidence: Evidence, one_step: Response, free_run: Response, warnings: list[Any]
+    fit: Estimate,
+    evidence: Evidence,
+    one_step: Response,
+    free_run: Response,
+    warnings: list[Warning],
 ) -> dict[str, Any]:
     """Return the findings on a fit, with the `budget` of its biases; warnings are added.
 
@@ -139,7 +143,7 @@ def _of_lagged(
     evidence: Evidence,
     one_step: Response,
     free_run: Response,
-    warnings: list[Any],
+    warnings: list[Warning],
 ) -> dict[str, Any]:
     problem, terms = fit.problem, cache(partial(_terms, fit, evidence))
     suspects = evidence.suspects
@@ -174,7 +178,7 @@ def _of_lagged(
     }
 
 
-def _physical(fit: LaggedEstimate, evidence: Evidence, warnings: list[Any]) -> dict[str, Any]:
+def _physical(fit: LaggedEstimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
     """Return the physical parameters of θ̂ and their findings, where there is a map to them."""
     if evidence.map is None:
         return {}
@@ -216,7 +220,7 @@ def _of_motion(
     evidence: Evidence,
     one_step: Response,
     free_run: Response,
-    warnings: list[Any],
+    warnings: list[Warning],
 ) -> dict[str, Any]:
     record = fit.problem.record
     x, u = np.split(fit.reach(record), [fit.model.form.states], axis=1)

@@ -12,6 +12,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
 from orthaug.fitting.colour import correlation_length
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
@@ -31,7 +32,7 @@ _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlet
 _LEVEL = 0.01  # of the test whether a residual is white
 
 
-def robust_where_asked(fit: Any, response: Response) -> Any:
+def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
     """Return the fit with standard errors that suit its errors: plain, or robust.
 
     Robust ones hold under colour or uneven size.
@@ -93,7 +94,7 @@ def _by_colour(fit: Any) -> Any:
     return _withheld(fit)
 
 
-def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
+def _robust(fit: Estimate, lags: int | None, kind: str | None = None) -> Estimate:
     """Return the fit with robust standard errors; as it is where there can be none."""
     try:
         return fit.robust(lags) if kind is None else fit.robust(lags, kind)
@@ -101,7 +102,7 @@ def _robust(fit: Any, lags: int | None, kind: str | None = None) -> Any:
         return fit
 
 
-def _has_rows(fit: Any, rows: int) -> bool:
+def _has_rows(fit: Estimate, rows: int) -> bool:
     """Return whether the derivatives of every row exist, and fit into memory."""
     gram = fit.model.statistics.gram
     if (

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from orthaug._base.errors import Warning
@@ -12,11 +10,12 @@ from orthaug.analysis.residuals import RunningResidual
 from orthaug.data.part import Part
 from orthaug.data.sources import rows_of
 from orthaug.models.long_runs import scores_along
+from orthaug.models.model import Model
 from orthaug.models.response import Response
 
 
 def score_part(
-    model: Any, part: Part, warnings: list[Any]
+    model: Model, part: Part, warnings: list[Warning]
 ) -> tuple[PartScores, tuple[Response, Response]]:
     """Return the scores of a part, and the responses that they come from.
 
@@ -52,7 +51,7 @@ def score_part(
     return PartScores.model_validate(scores), responses
 
 
-def _score_along(model: Any, part: Part, warnings: list[Any]) -> PartScores:
+def _score_along(model: Model, part: Part, warnings: list[Warning]) -> PartScores:
     """Return scores and residual tests over all rows of a part that is kept as a subsample."""
     assert part.source is not None
     whole = len(part.record) == rows_of(part.source)  # its tests are those of the result

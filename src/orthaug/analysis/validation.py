@@ -103,13 +103,10 @@ def free_run_error(
     model: Model,
     record: Record,
     skip: int | tuple[int, ...] = 0,
-    unit: Any = None,
     *,
     response: Response | None = None,
 ) -> float:
-    """Return the RMS of the free run's error, each output in its `unit`.
-
-    By default that is its own deviation.
+    """Return the RMS of the free run's error, each output in its deviation.
 
     Inf where it diverges.
 
@@ -120,7 +117,6 @@ def free_run_error(
         return math.inf
     scores = response.scores(skip)
     relative = np.where(np.isfinite(scores.nrmse), scores.nrmse, scores.rmse / model.deviation)
-    relative = relative if unit is None else scores.rmse / unit
     return float(np.sqrt(np.mean(relative**2))) if np.isfinite(relative).all() else math.inf
 
 
@@ -316,16 +312,12 @@ def extrapolation(part: str, x: Matrix, training: Matrix, layout: Layout) -> lis
     return list(leaving.values())
 
 
-def dominance(fit: Estimate, *, one_step: Response | None = None) -> float | None:
+def dominance(fit: Estimate) -> float | None:
     """Return ‖F̃‖ / ‖Φθ̂‖ over the training rows, the learner's part against the physics'.
 
     None where the physics gives 0.
-
-    `one_step` is the prediction of these rows, if it is there already.
     """
-    parts = (
-        fit.model.components(fit.problem.record) if one_step is None else one_step
-    ).trajectories
+    parts = fit.model.components(fit.problem.record).trajectories
     learner = math.sqrt(sum(float(np.nansum(t.learner**2)) for t in parts))
     physics = math.sqrt(sum(float(np.nansum(t.baseline**2)) for t in parts))
     return learner / physics if physics > 0 else None

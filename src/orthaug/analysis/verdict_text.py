@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent
+from orthaug._base.lines import join_words, percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.input_timing import LateInput
 from orthaug.analysis.missing_terms import MissingTest
@@ -296,7 +296,7 @@ def _cause(seen: Finding) -> str:
     followed = [name for test in seen.own for name in (*test.follows(), *test.curved_over(SHARE))]
     if followed:
         return (
-            f"the effect of {_join_names(followed[:_LISTED])} has a form that was not tried, or "
+            f"the effect of {join_words(followed[:_LISTED])} has a form that was not tried, or "
             "dynamics beyond the lags; test a form by your own `[[suspects]]`"
         )
     if seen.drifts:
@@ -310,10 +310,6 @@ def _cause(seen: Finding) -> str:
     )
 
 
-def _join_names(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def _small_residual_text(seen: Finding) -> str:
     """Return sentences on a residual that the tests reject but hardly anything predicts."""
     colour = (
@@ -321,7 +317,7 @@ def _small_residual_text(seen: Finding) -> str:
     )
     followed = seen.follows()
     shown = (
-        f"mostly noise, but still follows {_join_names(followed)}"
+        f"mostly noise, but still follows {join_words(followed)}"
         if followed
         else "noise by all tests"
     )

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from orthaug._base.checks import Matrix, Vector
-from orthaug.data.record import Experiment, Record
+from orthaug._base.checks import Matrix, Vector, positive
+from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics
 from orthaug.models.model import Model
 from orthaug.models.response import Response
@@ -144,7 +144,7 @@ class RunSample:
     points: RunPoints
     steps: int
     unit: Vector
-    diverged: tuple[str, ...] = ()
+    diverged: tuple[str, ...]
 
 
 def usable(model: Model, record: Record) -> Record:
@@ -160,56 +160,28 @@ def usable(model: Model, record: Record) -> Record:
 
 
 def sample_free_run(model: Model, record: Record, free_run: Response, most: int) -> RunSample:
-    """Return states of a free run from measured outputs, up to where it diverged."""
+    """Return points of a free run from measured outputs, spread evenly up to where it diverged."""
     form: Dynamics = model.form
     record, start, runs = usable(model, record), form.first_row, free_run.trajectories
     ends = [t.diverged[0] + 1 if t.diverged else len(t.model) for t in runs]
-
-    def states(
-        i: int, experiment: Experiment, inputs: Matrix, rows: Int[np.ndarray, "r"]
-    ) -> Matrix:
-        outputs = np.concatenate([experiment.outputs[:start], runs[i].model[start:]])
-        return form.states_at(model.numbers, outputs, inputs, rows)
-
-    found = _visits(form, record, ends, most, states)
-    diverged = [
+    every = RowIndex.of([end - start for end in ends], start)
+    some = every.take(even_indices(len(every), most))
+    pieces = []
+    for i, (experiment, run) in enumerate(zip(record.experiments, runs, strict=True)):
+        rows = some.row[some.experiment == i]
+        inputs = form.inputs(experiment, record)
+        outputs = np.concatenate([experiment.outputs[:start], run.model[start:]])
+        states = form.states_at(model.numbers, outputs, inputs, rows)
+        pieces.append((states, inputs[rows - start]))
+    visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
+    points = RunPoints(visited, inputs, some)
+    unit = _units(form, points, np.concatenate([e.outputs for e in record.experiments]))
+    diverged = tuple(
         f"{t.diverged[1]} at experiment {i}, {e.where(t.diverged[0])}"
         for i, (e, t) in enumerate(zip(record.experiments, runs, strict=True))
         if t.diverged
-    ]
-    return replace(found, diverged=tuple(diverged))
-
-
-def sample_measured(model: Model, record: Record, most: int) -> RunSample:
-    """Return states as the measured outputs give them."""
-    form: Dynamics = model.form
-    record = usable(model, record)
-    ends = [len(e) for e in record.experiments]
-    return _visits(form, record, ends, most, lambda i, e, inputs, rows: form.start(e.outputs, rows))
-
-
-def _visits(
-    form: Dynamics,
-    record: Record,
-    ends: Sequence[int],
-    most: int,
-    states: Callable[[int, Experiment, Any, Any], Matrix],
-) -> RunSample:
-    """Return points spread evenly over all experiments, up to the end of each."""
-    every = RowIndex.of([end - form.first_row for end in ends], form.first_row)
-    some = every.take(even_indices(len(every), most))
-    pieces = []
-    for i, experiment in enumerate(record.experiments):
-        rows = some.row[some.experiment == i]
-        inputs = form.inputs(experiment, record)
-        pieces.append((states(i, experiment, inputs, rows), inputs[rows - form.first_row]))
-    visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
-    points = RunPoints(visited, inputs, some)
-    return RunSample(
-        points,
-        len(every),
-        _units(form, points, np.concatenate([e.outputs for e in record.experiments])),
     )
+    return RunSample(points, len(every), unit, diverged)
 
 
 def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
@@ -229,8 +201,3 @@ def even_indices(count: int, most: int) -> Int[np.ndarray, "m"]:
     return (
         np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(int)
     )
-
-
-def positive(scale: Vector) -> Vector:
-    """Return the scale, 1 where it is 0 or not finite."""
-    return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)

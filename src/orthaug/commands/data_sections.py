@@ -27,6 +27,7 @@ from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA
+from orthaug.fitting.noise import OF_LAGGED
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_states
 from orthaug.physics.integrators import INTEGRATORS
@@ -271,6 +272,22 @@ class MotionSection(KindSection):
         washout = {} if "washout" in training.model_fields_set else {"washout": 0}
         return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
 
+    def check_noise(self, spec: Any, found: str) -> None:
+        """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
+        if spec.noise.model == "arma" or spec.noise.model_fields_set - {"model"}:
+            what = "" if spec.noise.model == "arma" else "; `ar`, `ma` and `largest` are of `arma`"
+            raise ValueError(f"{found} beside [motion]{what}: `noise.model` = arma {OF_LAGGED}")
+        if spec.controller is not None:
+            raise ValueError(
+                f"{found} beside [controller]; expected white, or no controller: the predictor "
+                "follows the measured outputs, so give the plant's own input"
+            )
+        if spec.engine.kind not in ("auto", "memory"):
+            raise ValueError(
+                f"{found} beside `engine.kind` = {spec.engine.kind}; expected memory, where a "
+                "predictor follows the outputs"
+            )
+
     def motion_of(self, inputs: Sequence[str], outputs: Sequence[str], folder: Path) -> Motion:
         """Return the motion, with its channels in the order of the data.
 
@@ -314,3 +331,25 @@ class MotionSection(KindSection):
             substeps=substeps,
             hold=self.hold,
         )
+
+
+def with_source_in_motion(content: Any) -> Any:
+    """Return the content of a spec with `[physics.source]` in `[motion]`, where other code has it.
+
+    Raises:
+        ValueError: a source beside other physics.
+    """
+    physics = content.get("physics") if isinstance(content, Mapping) else None
+    if not isinstance(physics, Mapping) or "source" not in physics:
+        return content
+    beside = next((key for key in physics if key != "source"), None)
+    if beside is not None:
+        raise ValueError(
+            f"`physics.{beside}`: found beside [physics.source]; expected none, because the source "
+            "has parameters of its own"
+        )
+    motion = content.get("motion", {})
+    if not isinstance(motion, Mapping):
+        return content
+    others = {name: section for name, section in content.items() if name != "physics"}
+    return others | {"motion": {**motion, "source": physics["source"]}}

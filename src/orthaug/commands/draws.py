@@ -13,7 +13,6 @@ from orthaug._base.checks import Matrix, check_choice, check_count, check_number
 from orthaug._base.errors import InputError, TrainingError
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.examination import with_verdict
-from orthaug.analysis.imitation import Alternative
 from orthaug.commands.advice import apply_change
 from orthaug.commands.design import design_for
 from orthaug.commands.fit import FitReport, fit_variant
@@ -345,7 +344,8 @@ def _choices(
                 yield "measure", measure.name, lambda m=measure: fit.split(m)
     for other in plan.system.other_inputs() if not _is_of_terms(job) else ():
         change = {"learner.inputs": list(other.inputs)}
-        yield "inputs", _inputs_name(other), lambda c=change: _run_changed(job, c, criterion)
+        names = ", ".join(other.inputs)
+        yield "inputs", names, lambda c=change: _run_changed(job, c, criterion)
     if plan.job.problem.count <= _MOST_ROWS:
         yield (
             "rows",
@@ -364,10 +364,6 @@ def _choices(
 def _once(job: Job, criterion: Any) -> Any:
     """Return the fit of a job from one start."""
     return replace(job, spec=_changed(job, _ONE_START)).run(Variant(criterion=criterion))
-
-
-def _inputs_name(other: Alternative) -> str:
-    return ", ".join(other.inputs)
 
 
 def _is_of_terms(job: Job) -> bool:

@@ -20,6 +20,7 @@ from orthaug.commands import job_result
 from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import AS_DECLARED, Job, Variant, origin_of
+from orthaug.fitting.estimates import Estimate
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def fit_variant(job: Job, variant: Variant, progress: Progress = SILENT) -> FitR
     return report_of(job, job.run(variant, progress))
 
 
-def report_of(job: Job, fit: Any, evidence: Evidence | None = None) -> FitReport:
+def report_of(job: Job, fit: Estimate, evidence: Evidence | None = None) -> FitReport:
     """Score a fit on every part of its job, and fill its result up to the verdict.
 
     Args:

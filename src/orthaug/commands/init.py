@@ -13,7 +13,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
-from orthaug._base.lines import percent, plural
+from orthaug._base.lines import first_words, percent, plural
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
@@ -374,7 +374,7 @@ def question(found: Survey, inputs: Names | None = None, outputs: Names | None =
     free = [c for c in found.signals if id(c) not in given]
     if not found.signals or (outputs is None and not free):
         raise InputError(f"{found.path}: {_no_output_reason(found, _join(inputs))}")
-    some = _list_columns([c.header for c in found.signals])
+    some = first_words([c.header for c in found.signals], _LISTED)
     output = free.pop() if outputs is None else None
     rows = next((c.filled for c in (output, *given.values()) if c is not None), 0)
     alike = [c.header for c in free if c.filled == rows] or [c.header for c in free]
@@ -425,14 +425,8 @@ def _no_output_reason(found: Survey, inputs: str | None) -> str:
 def list_unused(found: Survey, used: Sequence[Column]) -> str:
     """Return a list of the unused columns, except the time, with the reasons."""
     apart = {id(c) for c in (*used, found.clock.column)}
-    return _list_columns(
-        [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
-    )
-
-
-def _list_columns(columns: Sequence[str]) -> str:
-    more = f" and {len(columns) - _LISTED} more" if len(columns) > _LISTED else ""
-    return ", ".join(columns[:_LISTED]) + more
+    others = [f"{c.header} ({found.why_not(c)})" for c in found.columns if id(c) not in apart]
+    return first_words(others, _LISTED)
 
 
 def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) -> Draft:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from orthaug.analysis.findings import SuspectResult
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
+    from orthaug.fitting.estimates import Estimate
     from orthaug.fitting.structures import Structure
     from orthaug.inference.measures import Measure
     from orthaug.models.response import Response
@@ -266,7 +267,7 @@ class Job:
             return str(error)
         return None
 
-    def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Any:
+    def run(self, variant: Variant = AS_DECLARED, progress: Progress = SILENT) -> Estimate:
         """Train as the spec says, or a variant of that."""
         if variant.fold is not None:
             return self.fold_fit(variant)(variant.fold)

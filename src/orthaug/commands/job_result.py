@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.commands.job import Job
 from orthaug.reports.result import CheckResult, FitResult
 
 if TYPE_CHECKING:
+    from orthaug.fitting.estimates import Estimate
     from orthaug.models.response import Response
     from orthaug.reports.drawing import Figure
 
@@ -39,7 +40,7 @@ def check(job: Job) -> CheckResult:
 
 def figures(
     job: Job,
-    fit: Any,
+    fit: Estimate,
     result: FitResult,
     responses: Mapping[str, tuple[Response, Response]],
 ) -> dict[str, Figure]:
@@ -54,7 +55,7 @@ def figures(
         "simulation": plots.output_figure(free, f"free run, {where}"),
     }
     found = result.residuals
-    units = {channel.name: channel.unit for channel in (*fit.model.inputs, *fit.model.outputs)}
+    units = fit.model.units
     for name, tests in (
         ("one-step", found and found.one_step),
         ("free-run", found and found.free_run),
@@ -70,7 +71,7 @@ def figures(
 
 
 def physics_alone(
-    job: Job, fit: Any, responses: Mapping[str, tuple[Response, Response]]
+    job: Job, fit: Estimate, responses: Mapping[str, tuple[Response, Response]]
 ) -> Mapping[str, Response]:
     """Return the free run of every part by the model's physics without its learner."""
     return {

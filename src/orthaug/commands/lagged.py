@@ -131,7 +131,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
         problem, unit = fit.problem, fit.problem.deviation
         rows = slice(None, None, 1 + len(problem.rows.x) // _ROWS)
         x = problem.rows.x[rows]
-        phi = np.asarray(problem.baseline.phi(x, problem.layout, problem.outputs, np))
+        phi = problem.phi(x)
         phi = phi / unit[:, None]
         basis = np.linalg.qr(phi.reshape(-1, phi.shape[2]))[0]
         whole = (fit.model.predict(problem.record).errors[rows] / unit).ravel()

@@ -109,7 +109,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             place = equations_of(motion)[places[0]] if len(places) == 1 else None
         if place not in motion.names_of_states:
             return None
-        key = "next" if motion.scheme.discrete else "derivative"
+        key = motion.equation_key
         own = str(job.declaration["motion"]["states"][place][key])
         if f"*{''.join(expression.split())}" in "".join(own.split()):
             return None

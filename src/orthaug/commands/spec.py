@@ -10,7 +10,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -33,6 +32,7 @@ from orthaug.commands.data_sections import (
     MotionSection,
     Range,
     SourceSection,
+    with_source_in_motion,
 )
 from orthaug.commands.sections import (
     Count,
@@ -50,9 +50,9 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
-from orthaug.fitting.noise import ARMA, OF_LAGGED, OF_MOTIONS, Innovations, Noise, Order
+from orthaug.fitting.noise import ARMA, OF_MOTIONS, Innovations, Noise, Order
 from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
-from orthaug.fitting.structures import Structure
+from orthaug.fitting.structures import Structure, with_measure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
@@ -83,16 +83,18 @@ _BESIDE_MOTION = {
 }
 
 
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
 class LagsSection(Section):
     """The learner's regressor, by orders as in MATLAB."""
 
     na: Orders = 0
     nb: Orders = 0
     nk: Orders = 1
+
+    @property
+    def declared(self) -> Lags:
+        """The declaration."""
+        orders = (self.na, self.nb, self.nk)
+        return Lags(*(tuple(v) if isinstance(v, list) else v for v in orders))
 
 
 class TermSection(Section):
@@ -107,6 +109,11 @@ class TermSection(Section):
     min: Finite | None = None
     max: Finite | None = None
 
+    @property
+    def declared(self) -> Term:
+        """The declaration."""
+        return Term(**{**self.model_dump(), "regressor": str(self.regressor)})
+
 
 class BaselineSection(Section):
     """The physics."""
@@ -119,6 +126,11 @@ class BaselineSection(Section):
     terms: Annotated[list[TermSection], Field(min_length=1)]
     constants: dict[str, Finite] = {}
 
+    @property
+    def declared(self) -> Baseline:
+        """The declaration."""
+        return Baseline.from_terms([term.declared for term in self.terms], self.constants)
+
     def over(self, learner: Any, spec: Spec) -> Learner:
         """Return a learner of terms over the lags of a spec."""
         channels = tuple(spec.data.outputs), tuple(spec.data.inputs)
@@ -128,6 +140,28 @@ class BaselineSection(Section):
         """Return the criterion of a spec."""
         return resolve(training.declared(CRITERIA, training.chosen_focus()))
 
+    def check_noise(self, spec: Spec, found: str) -> None:
+        """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
+        if spec.noise.model == "innovations":
+            raise ValueError(f"`noise.model` = innovations {OF_MOTIONS}")
+        if spec.declared_criterion().free_run is not None:
+            raise ValueError(
+                f"{found}, but training is not one step ahead; expected `training.focus` "
+                "prediction with a `horizon` of 1, or white noise"
+            )
+        if not spec.declared_solver().gauss_newton or spec.declared_structure().from_initial:
+            raise ValueError(
+                f"{found}; expected solver levenberg-marquardt and a solved θ with it, or white "
+                "noise"
+            )
+        if spec.training.ensemble:
+            raise ValueError(f"{found}; expected `training.ensemble` = false with it")
+        if spec.engine.kind not in ("auto", "memory"):
+            raise ValueError(
+                f"{found} beside `engine.kind` = {spec.engine.kind}; expected memory, because the "
+                "filter of a noise model needs all rows in their order"
+            )
+
 
 class PhysicsSection(Section):
     """Physical parameters, and the expressions of θ in them."""
@@ -135,6 +169,11 @@ class PhysicsSection(Section):
     parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
     theta: Annotated[dict[str, str], Field(min_length=1)]
     profile: bool = False
+
+    def declared(self, constants: Mapping[str, float]) -> PhysicsMap:
+        """Return the physical parameters and their map to θ, with constants by their names."""
+        parameters = [section.declared(name) for name, section in self.parameters.items()]
+        return PhysicsMap.of(parameters, self.theta, constants)
 
 
 class SuspectSection(Section):
@@ -217,7 +256,8 @@ class TrainingSection(KindSection):
             self.declared(SOLVERS, self.solver),
             self.declared(CRITERIA, self.chosen_focus()),
         )
-        check_solver(solver, criterion, _as_list(self.regularization))
+        given = self.regularization
+        check_solver(solver, criterion, given if isinstance(given, list) else [given])
         return self
 
     def chosen_focus(self) -> str:
@@ -365,49 +405,9 @@ class Spec(Section):
 
     @model_validator(mode="after")
     def _noise_fits(self) -> Spec:
-        if self.noise.model == "white":
-            return self
-        found = f"`noise.model`: found {self.noise.model}"
-        if self.motion is not None:
-            self._check_noise_of_motion(found)
-            return self
-        if self.noise.model == "innovations":
-            raise ValueError(f"`noise.model` = innovations {OF_MOTIONS}")
-        criterion, solver = self.declared_criterion(), self.declared_solver()
-        if criterion.free_run is not None:
-            raise ValueError(
-                f"{found}, but training is not one step ahead; expected `training.focus` "
-                "prediction with a `horizon` of 1, or white noise"
-            )
-        if not solver.gauss_newton or self.declared_structure().from_initial:
-            raise ValueError(
-                f"{found}; expected solver levenberg-marquardt and a solved θ with it, or white "
-                "noise"
-            )
-        if self.training.ensemble:
-            raise ValueError(f"{found}; expected `training.ensemble` = false with it")
-        if self.engine.kind not in ("auto", "memory"):
-            raise ValueError(
-                f"{found} beside `engine.kind` = {self.engine.kind}; expected memory, because the "
-                "filter of a noise model needs all rows in their order"
-            )
+        if self.noise.model != "white":
+            self.declared_physics.check_noise(self, f"`noise.model`: found {self.noise.model}")
         return self
-
-    def _check_noise_of_motion(self, found: str) -> None:
-        """Raise ValueError for a noise model that the motion cannot have."""
-        if self.noise.model == "arma" or self.noise.model_fields_set - {"model"}:
-            what = "" if self.noise.model == "arma" else "; `ar`, `ma` and `largest` are of `arma`"
-            raise ValueError(f"{found} beside [motion]{what}: `noise.model` = arma {OF_LAGGED}")
-        if self.controller is not None:
-            raise ValueError(
-                f"{found} beside [controller]; expected white, or no controller: the predictor "
-                "follows the measured outputs, so give the plant's own input"
-            )
-        if self.engine.kind not in ("auto", "memory"):
-            raise ValueError(
-                f"{found} beside `engine.kind` = {self.engine.kind}; expected memory, where a "
-                "predictor follows the outputs"
-            )
 
     @property
     def declared_physics(self) -> BaselineSection | MotionSection:
@@ -425,23 +425,12 @@ class Spec(Section):
 
     def lag_orders(self) -> Lags | None:
         """Return the learner's orders; None for the raw lags that the baseline uses."""
-        if self.lags is None:
-            return None
-        return Lags(
-            *(
-                tuple(v) if isinstance(v, list) else v
-                for v in (self.lags.na, self.lags.nb, self.lags.nk)
-            )
-        )
+        return None if self.lags is None else self.lags.declared
 
     def declared_baseline(self) -> Baseline:
         """Return the baseline as declared."""
         assert self.baseline is not None, "a motion has no baseline"
-        terms = [
-            Term(t.parameter, str(t.regressor), t.initial, t.unit, t.output, t.fixed, t.min, t.max)
-            for t in self.baseline.terms
-        ]
-        return Baseline.from_terms(terms, self.baseline.constants)
+        return self.baseline.declared
 
     def declared_motion(self) -> Motion:
         """Return the motion, in the loop of its controller where there is one.
@@ -462,10 +451,7 @@ class Spec(Section):
         """
         if self.physics is None or self.baseline is None:
             return None
-        parameters = [section.declared(name) for name, section in self.physics.parameters.items()]
-        return PhysicsMap.of(
-            parameters, self.physics.theta, {SAMPLING_TIME: sampling_time} | self.baseline.constants
-        )
+        return self.physics.declared({SAMPLING_TIME: sampling_time} | self.baseline.constants)
 
     def declared_learner(self) -> Learner | None:
         """Return the learner; None for physics alone, as of a motion with no learned part."""
@@ -487,8 +473,7 @@ class Spec(Section):
         It has a measure where it splits θ.
         """
         structure = resolve(self.structure.declared(STRUCTURES, kind or self.structure.kind))
-        takes = any(field.name == "measure" for field in fields(structure))
-        return replace(structure, measure=measure) if takes and measure is not None else structure
+        return structure if measure is None else with_measure(structure, measure)
 
     def declared_measure(self, place: MeasurePlace) -> Measure:
         """Return the measure, with its data read from files."""
@@ -556,28 +541,6 @@ class Spec(Section):
         )
 
 
-def with_source_in_motion(content: Any) -> Any:
-    """Return the content of a spec with `[physics.source]` in `[motion]`, where other code has it.
-
-    Raises:
-        ValueError: a source beside other physics.
-    """
-    physics = content.get("physics") if isinstance(content, Mapping) else None
-    if not isinstance(physics, Mapping) or "source" not in physics:
-        return content
-    beside = next((key for key in physics if key != "source"), None)
-    if beside is not None:
-        raise ValueError(
-            f"`physics.{beside}`: found beside [physics.source]; expected none, because the source "
-            "has parameters of its own"
-        )
-    motion = content.get("motion", {})
-    if not isinstance(motion, Mapping):
-        return content
-    others = {name: section for name, section in content.items() if name != "physics"}
-    return others | {"motion": {**motion, "source": physics["source"]}}
-
-
 def spec_error(error: KeyedError) -> InputError:
     """Return an error in one key of a declaration in the words of a spec."""
     return SpecError(f"'{_SECTIONS.get(error.key, f'training.{error.key}')}'{error.words}.")
@@ -620,12 +583,6 @@ def _spec_model(registered: object) -> type[Spec]:
     return create_model("Spec", __base__=Spec, **fields)
 
 
-def _as_validated(content: dict[str, Any]) -> dict[str, Any]:
-    with suppress(ValueError):
-        return with_source_in_motion(content)
-    return content
-
-
 def load_spec(path: Path) -> Spec:
     """Read and check a spec file.
 
@@ -649,7 +606,9 @@ def load_spec(path: Path) -> Spec:
     try:
         return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        message = first_message(error, _as_validated(content), model)
+        with suppress(ValueError):
+            content = with_source_in_motion(content)
+        message = first_message(error, content, model)
         message = message.replace("motion.source", "physics.source")
         raise SpecError(f"{path}: {message}{'' if message.endswith('?') else '.'}") from None
     except RecursionError:

@@ -44,13 +44,12 @@ def motion_section(motion: Motion) -> Any:
     """Return `[motion]` of a motion of expressions, with its parameters' initial values."""
     section = tomlkit.table()
     section.add("integrator", motion.integrator)
-    equation = "next" if motion.scheme.discrete else "derivative"
     if not motion.scheme.discrete:
         section.add("hold", motion.hold)
     states, parameters = tomlkit.table(), tomlkit.table()
     for state in motion.states:
         own = tomlkit.inline_table()
-        own.update({equation: state.derivative})
+        own.update({motion.equation_key: state.derivative})
         own.update({} if state.start is None else {"start": state.start})
         own.update({"learned": True} if state.learned else {})
         states.add(state.name, own)

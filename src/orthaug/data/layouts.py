@@ -379,7 +379,7 @@ def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
                 raise InputError(f"{path}: the workbook has no worksheet with cells.")
             sheet = book.worksheets[0]
             _check_order(path, sheet)
-            _check_strings(path, sheet)
+            _check_strings(sheet)
             return _pick(path, sheet, place)
         finally:
             book.close()
@@ -452,7 +452,7 @@ class _Strings(tuple[str, ...]):
         return super().__getitem__(index)
 
 
-def _check_strings(path: Path, sheet: Any) -> None:
+def _check_strings(sheet: Any) -> None:
     if hasattr(sheet, "_shared_strings"):
         sheet._shared_strings = _Strings(sheet._shared_strings or ())
 

@@ -238,7 +238,8 @@ def prepared_experiments(
         keep: keep outputs that are missing.
     """
     found: list[Experiment] = []
-    done = [_Account(_kind(step), step) for step in steps]
+    kinds = {STEPS[kind]: kind for kind in STEPS}
+    done = [_Account(kinds[type(step)], step) for step in steps]
     sampling, lost, where = [], 0, ""
     for run, place in runs:
         for account in done:
@@ -292,10 +293,6 @@ def _options_of(step: Any) -> dict[str, Any]:
         name: list(value) if isinstance(value, tuple) else value for name, value in found.items()
     }
     return {name: value for name, value in plain.items() if value is not None}
-
-
-def _kind(step: Any) -> str:
-    return next(kind for kind in STEPS if STEPS[kind] is type(step))
 
 
 def _pieces(run: Run, place: Experiment, keep: bool) -> list[Experiment]:

@@ -234,12 +234,9 @@ class Outliers:
         columns = run.columns(self.channels, range(run.inputs, len(run.names)))
         values = run.values[:, columns].copy()
         for x in values.T:
-            x[self._wild(x)] = np.nan
+            distance, deviation = self.distances(x)
+            x[distance > self.threshold * deviation] = np.nan
         return run.with_values(columns, values)
-
-    def _wild(self, x: Vector) -> np.ndarray:
-        distance, deviation = self.distances(x)
-        return distance > self.threshold * deviation
 
     def distances(self, x: Vector) -> tuple[Vector, Vector]:
         """Return the distance of each sample from the median of its window, and the deviation.

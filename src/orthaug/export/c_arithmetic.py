@@ -6,23 +6,18 @@ from collections.abc import Callable
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS, Language, decimal, functions_in, names_in, wrap_items
+from orthaug.export.nodes import (
+    ACTIVATIONS,
+    SHARED_NAMES,
+    Language,
+    decimal,
+    functions_in,
+    names_in,
+    wrap_items,
+)
 from orthaug.export.program import Block, Constant, Layer, Program
 
-_MATH = {
-    "sin",
-    "cos",
-    "tan",
-    "atan",
-    "atan2",
-    "exp",
-    "log",
-    "sqrt",
-    "floor",
-    "tanh",
-    "expm1",
-    "log1p",
-}
+_MATH = {*SHARED_NAMES, "atan", "atan2"}
 _OWN = {
     "sign": "static real sign(real a) { return a > 0 ? 1 : a < 0 ? -1 : a; } /* NaN stays NaN */",
     "min": "static real least(real a, real b) { return a < b || isnan(a) ? a : b; }",

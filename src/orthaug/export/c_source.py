@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from orthaug._base.checks import free_name
 from orthaug.export import c_arithmetic
 from orthaug.export.c_arithmetic import FIELD_WORDS
 from orthaug.export.program import Program, Signal, Vectors
@@ -60,8 +61,7 @@ def fields_of(program: Program) -> list[tuple[str, Signal, int]]:
     taken: set[str] = set(FIELD_WORDS)
     fields = []
     for identifier, signal, depth in wanted:
-        while identifier in taken:
-            identifier += "_"
+        identifier = free_name(identifier, taken)
         taken.add(identifier)
         fields.append((identifier, signal, depth))
     return fields

@@ -16,6 +16,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from orthaug import __version__
+from orthaug._base.checks import free_name
 from orthaug._base.errors import InputError
 from orthaug.export.c_source import CSource, fields_of, places_of
 from orthaug.export.program import Program, Vectors
@@ -163,9 +164,9 @@ def _description(program: Program) -> str:
     variables, taken = [], set()
     for causality, variability, initial, signals in kinds:
         for signal in signals:
-            name = _unique(
-                f"state.{signal.identifier}" if causality == "local" else signal.identifier, taken
-            )
+            name = f"state.{signal.identifier}" if causality == "local" else signal.identifier
+            name = free_name(name, taken)
+            taken.add(name)
             start = ' start="0"' if causality != "output" else ""
             exact = f' initial="{initial}"' if initial else ""
             variables.append(
@@ -193,10 +194,3 @@ def _description(program: Program) -> str:
   </ModelStructure>
 </fmiModelDescription>
 """
-
-
-def _unique(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name

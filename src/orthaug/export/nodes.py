@@ -30,6 +30,8 @@ ARITHMETIC: dict[str, Callable[..., float]] = {
     "whole_power": lambda a, b: a**b,
 }
 """A node may also hold every function of expressions."""
+SHARED_NAMES = ("sin", "cos", "tan", "exp", "log", "sqrt", "floor", "tanh", "expm1", "log1p")
+"""Functions with this name in C, NumPy and CasADi."""
 
 
 @dataclass(frozen=True)

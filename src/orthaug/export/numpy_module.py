@@ -5,24 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from orthaug.export.nodes import SHARED_NAMES
 from orthaug.export.program import Program, Vectors
 from orthaug.export.python_code import Dialect, arithmetic, declarations, python_language
 
-_SAME = (
-    "sin",
-    "cos",
-    "tan",
-    "exp",
-    "log",
-    "sqrt",
-    "abs",
-    "sign",
-    "floor",
-    "tanh",
-    "expm1",
-    "log1p",
-    "power",
-)
+_SAME = (*SHARED_NAMES, "abs", "sign", "power")
 _OTHER = {"atan": "np.arctan", "atan2": "np.arctan2", "min": "np.minimum", "max": "np.maximum"}
 NUMPY = Dialect(
     python_language({name: f"np.{name}" for name in _SAME} | _OTHER),

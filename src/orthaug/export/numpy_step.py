@@ -10,7 +10,7 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.export.lowering import program_of
-from orthaug.export.nodes import ACTIVATIONS, Apply, Entry, Name, Node, Number
+from orthaug.export.nodes import ACTIVATIONS, SHARED_NAMES, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
 from orthaug.models.model import Model
 from orthaug.physics.integrators import INTEGRATORS
@@ -19,20 +19,6 @@ Values = dict[str, Any]
 """`x`, `u`, `g` and intermediate results by name."""
 Evaluation = Callable[[Values], Any]
 
-_SAME = (
-    "sin",
-    "cos",
-    "tan",
-    "exp",
-    "log",
-    "sqrt",
-    "abs",
-    "sign",
-    "floor",
-    "tanh",
-    "expm1",
-    "log1p",
-)
 FUNCTIONS: dict[str, Any] = {
     "neg": np.negative,
     "add": lambda a, b: a + b,
@@ -45,7 +31,7 @@ FUNCTIONS: dict[str, Any] = {
     "atan2": np.arctan2,
     "min": np.minimum,
     "max": np.maximum,
-} | {name: getattr(np, name) for name in _SAME}
+} | {name: getattr(np, name) for name in (*SHARED_NAMES, "abs", "sign")}
 
 
 class NumpyStep:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug.export.nodes import ACTIVATIONS, Language, decimal, wrap_items
+from orthaug.export.nodes import ACTIVATIONS, SHARED_NAMES, Language, decimal, wrap_items
 from orthaug.export.program import Block, Program, Vectors
 
 
@@ -165,22 +165,7 @@ def substep(x, first, middle, last):
     return WHOLE @ x + FIRST @ begin + MIDDLE @ (at_a + at_b) + LAST @ rest(c, last)"""
 
 
-_SAME = (
-    "sin",
-    "cos",
-    "tan",
-    "atan",
-    "atan2",
-    "exp",
-    "log",
-    "sqrt",
-    "sign",
-    "floor",
-    "tanh",
-    "expm1",
-    "log1p",
-    "power",
-)
+_SAME = (*SHARED_NAMES, "atan", "atan2", "sign", "power")
 _OTHER = {"abs": "ca.fabs", "min": "ca.fmin", "max": "ca.fmax"}
 CASADI = Dialect(
     python_language({name: f"ca.{name}" for name in _SAME} | _OTHER),

@@ -36,7 +36,7 @@ from orthaug.inference.covariance import degrees_of_freedom, noise_covariance, t
 from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.splitting import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
-from orthaug.models.dynamics import Numbers
+from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Scaling
 from orthaug.models.model import Model, TrainedSegments
@@ -172,7 +172,7 @@ def _model_of(
     structure: Structure,
     learned: TrainedLearner,
     errors: ErrorStatistics,
-    form: Any,
+    form: Dynamics,
     numbers: Numbers,
     *,
     middle: Matrix | None,
@@ -586,7 +586,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
             f"{segmented.segments.count}, or other experiments. Give the files and --rows of "
             "its training."
         )
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     return MotionEstimate(
         model=model,
         status=Status(Ending.EXACT, 0, 0.0, np.nan),

@@ -155,7 +155,8 @@ class Simulation:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        _check_segment(self.segment)
+        if self.segment != "auto":
+            check_count(self.segment, "segment", least=0)
         if isinstance(self.segment, int) and self.segment and self.washout >= self.segment:
             raise KeyedError(
                 f"`washout` must be shorter than `segment`; got {self.washout} and "
@@ -270,9 +271,3 @@ def segment_for(record: Record, first_row: int, washout: int) -> int:
     remembered = int(np.argmax(np.append(short, True))) + 1
     segment = max(SHORT, _MEMORIES * remembered, 2 * washout)
     return 0 if 2 * segment > steps else segment
-
-
-def _check_segment(segment: object) -> None:
-    """Raise InputError for an invalid number of steps."""
-    if segment != "auto":
-        check_count(segment, "segment", least=0)

@@ -273,6 +273,11 @@ class Estimate(FitView):
         return self._std_of(self.covariance)
 
     @property
+    def known_std(self) -> Vector:
+        """The standard errors, NaN for all where there are none."""
+        return np.full(len(self.values), np.nan) if self.std is None else self.std
+
+    @property
     def plain_std(self) -> Vector | None:
         """The standard errors for white noise, where those of `std` are robust.
 

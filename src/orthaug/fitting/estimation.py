@@ -30,6 +30,7 @@ from orthaug.fitting.fit_plans import (
 )
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.lagged_estimate import LaggedEstimate
+from orthaug.fitting.learned import PlannedRun
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.noise import Noise
 from orthaug.fitting.rules import (
@@ -41,7 +42,7 @@ from orthaug.fitting.rules import (
 from orthaug.fitting.setup import TrainingSetup
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
-from orthaug.fitting.training import PlannedRun, plan_runs, train
+from orthaug.fitting.training import plan_runs, train
 from orthaug.models.learners import MLP, Learner, declared, learns
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine
@@ -249,7 +250,7 @@ def _checked(request: Request) -> Request:
     return replace(request, learner=declared(request.learner))
 
 
-def _fit_once(plan: FitPlan[Any]) -> Any:
+def _fit_once(plan: FitPlan[Any]) -> Estimate:
     """Return the estimate of one problem with one criterion."""
     problem, request, criterion = plan.problem, plan.request, plan.settled()
     blocks, validated = check_blocks(request.blocks), request.validation is not None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, positive
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug.fitting.segments import Segments
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def field_under(
-    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: Any
+    measure: Measure, segmented: SegmentedMotion, numbers: Numbers, states: np.ndarray
 ) -> tuple[Field, float, tuple[Warning, ...]]:
     """Return the points of a measure, its support by the data, and warnings.
 
@@ -33,7 +33,7 @@ def field_under(
             value.
     """
     motion, form = segmented.problem.motion, segmented.dynamics
-    c, w = np.asarray(numbers.theta - numbers.theta_aux), numbers.weights
+    c, w = np.asarray(numbers.c), numbers.weights
     x, u = segmented.trajectory(c, w, states)
     finite = np.isfinite(x).all(axis=1)
     x, u = x[finite], u[finite]
@@ -54,7 +54,7 @@ def field_under(
     return Field(at[finite], beside[finite], weight[finite] / weight.sum(), size), share, warnings
 
 
-def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
+def sizes_learned(segmented: SegmentedMotion, c: Vector, x: Matrix, u: Matrix) -> Vector:
     """Return the size (nl,) of each learned equation and output over the runs."""
     motion = segmented.problem.motion
     with np.errstate(all="ignore"):
@@ -65,7 +65,7 @@ def sizes_learned(segmented: SegmentedMotion, c: Any, x: Any, u: Any) -> Any:
     size = np.concatenate(
         [np.nanstd(rates[list(states)], axis=1), segmented.deviation[list(outputs)]]
     )
-    return np.where(np.isfinite(size) & (size > 0), size, 1.0)
+    return positive(size)
 
 
 def wobble(
@@ -112,7 +112,7 @@ def _sum_over(
     size: Float[Array, "nl"],
 ) -> Float[Array, "np n0+n m"]:
     numbers = form.prepare(numbers)
-    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+    c, w = numbers.c, numbers.weights
 
     def mixed_derivative(x: Any, row: Any) -> Any:
         def half(q: Any, x: Any) -> Any:

@@ -52,7 +52,7 @@ from orthaug.physics.innovations import InnovationsForm
 from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import Motion
 from orthaug.physics.output_weights import by_covariance
-from orthaug.physics.problem import MotionProblem, Problem, pose, pose_motion
+from orthaug.physics.problem import MotionProblem, PosedProblem, Problem, pose, pose_motion
 from orthaug.physics.streamed import pose_streamed
 
 Regularization = str | float
@@ -182,7 +182,7 @@ class FitPlan(ABC, Generic[P]):
         """Return the estimate of a task that is solved; None where it is trained."""
         return None
 
-    def finish(self, estimate: Any, prepared: Prepared, fit: Fit) -> Any:
+    def finish(self, estimate: Estimate, prepared: Prepared, fit: Fit) -> Estimate:
         """Return the estimate as it is handed over."""
         return estimate
 
@@ -203,7 +203,7 @@ class LaggedPlan(FitPlan[Problem]):
     def pose(
         cls,
         record: Record | Source,
-        physics: Any,
+        physics: Baseline,
         *,
         lags: Lags | None,
         learner: Learner | None,
@@ -335,7 +335,7 @@ class MotionPlan(FitPlan[MotionProblem]):
     def pose(
         cls,
         record: Record | Source,
-        physics: Any,
+        physics: Motion,
         *,
         lags: Lags | None,
         learner: Learner | None,
@@ -406,7 +406,7 @@ PLANS: tuple[type[FitPlan[Any]], ...] = (LaggedPlan, MotionPlan)
 """The kinds of physics that can be fitted."""
 
 
-def plan_of(problem: Any, request: Request) -> FitPlan[Any]:
+def plan_of(problem: PosedProblem, request: Request) -> FitPlan[Any]:
     """Return the plan by which a problem is fitted."""
     return next(plan for plan in PLANS if isinstance(problem, plan.problem_type))(problem, request)
 

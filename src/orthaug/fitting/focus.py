@@ -22,7 +22,8 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import LOG
 from orthaug.data.record import Record
 from orthaug.fitting.colour import autocorrelation
-from orthaug.fitting.criteria import Prediction
+from orthaug.fitting.criteria import Criterion, Prediction
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.held_out import (
     Candidate,
     Focus,
@@ -32,10 +33,12 @@ from orthaug.fitting.held_out import (
     squared_errors,
 )
 from orthaug.fitting.inconsistency import inconsistency
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.setup import quick_options
 from orthaug.fitting.training import fold_solver
 from orthaug.fitting.unfinished import NOT_CONVERGED
 from orthaug.models.learners import learns
+from orthaug.physics.problem import PosedProblem
 
 ONE_STEP, FREE_RUN = "prediction", "simulation"
 BLOCKS = 4  # blocks that are held out in turn where that is not said
@@ -67,7 +70,9 @@ Key = tuple[str, bool]
 """How a candidate was trained, and whether it has a learner."""
 
 
-def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: Any) -> Any:
+def choose_focus(
+    problem: PosedProblem, fit: Fit, options: Mapping[str, Any], criterion: Criterion
+) -> Estimate:
     """Return the best of the estimates one step ahead and on the free run.
 
     Args:
@@ -95,7 +100,9 @@ def choose_focus(problem: Any, fit: Fit, options: Mapping[str, Any], criterion: 
         return replace(first, focus=Focus(ONE_STEP, text))
 
 
-def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> str | None:
+def _why_not(
+    problem: PosedProblem, first: Estimate, fit: Fit, options: Mapping[str, Any]
+) -> str | None:
     """Return the reason why one step ahead is not enough; None where it is."""
     if not first.model.form.states:
         return None  # nothing is fed back: a free run is the prediction
@@ -120,7 +127,7 @@ def _why_not(problem: Any, first: Any, fit: Fit, options: Mapping[str, Any]) -> 
     return _INCONSISTENT if _is_inconsistent(first) else None
 
 
-def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | None:
+def _beside_physics(fit: Estimate, records: Sequence[Record], problem: PosedProblem) -> str | None:
     """Return the fault of a fit's free runs compared to those of its physics alone.
 
     None for nothing.
@@ -135,14 +142,14 @@ def _beside_physics(fit: Any, records: Sequence[Record], problem: Any) -> str | 
     return "its free run is worse than that of physics alone" if own > _SLACK**2 * alone else None
 
 
-def _errors(fit: Any, record: Record, problem: Any) -> Pieces:
+def _errors(fit: Estimate, record: Record, problem: PosedProblem) -> Pieces:
     """Return the squared errors along the free run of each experiment."""
     if fit is None or not fit.status.ok:
         return [None] * len(record.experiments)
     return squared_errors(fit.model.simulate(record), problem.deviation)
 
 
-def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, Any]:
+def _on_half(problem: PosedProblem, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, Any]:
     """Return a fit to the first half, and the other half; nothing for too few rows."""
     try:
         training, held = held_out_blocks(problem.record, HALVES, problem.first_row)[-1]
@@ -153,13 +160,13 @@ def _on_half(problem: Any, fit: Fit, options: Mapping[str, Any]) -> tuple[Any, A
         return None, None
 
 
-def _quick(options: Mapping[str, Any], solver: Any) -> dict[str, Any]:
+def _quick(options: Mapping[str, Any], solver: Solver) -> dict[str, Any]:
     """Return options for a quick fit to a part of the rows, by another solver."""
     own = {name: value for name, value in options.items() if name != "progress"}
     return {**quick_options(own), "solver": solver, "fallback": False, "checkpoints": None}
 
 
-def _is_coloured(fit: Any) -> bool:
+def _is_coloured(fit: Estimate) -> bool:
     """Return whether the one-step residual is clearly correlated with its past.
 
     And by more than a little.
@@ -185,7 +192,7 @@ def _rows(record: Record) -> int:
     return sum(map(len, record.experiments))
 
 
-def _free_run(criterion: Any, problem: Any) -> Any:
+def _free_run(criterion: Any, problem: Any) -> Criterion:
     """Return the free run to train, with a washout that leaves most of a record."""
     usable = max(map(len, problem.record.experiments)) - problem.first_row
     declared = criterion.simulation
@@ -198,11 +205,11 @@ def _free_run(criterion: Any, problem: Any) -> Any:
 class _FocusChoice:
     """A problem with its fit one step ahead, from which the other candidates are made."""
 
-    problem: Any
-    first: Any
+    problem: PosedProblem
+    first: Estimate
     fit: Fit
     options: Mapping[str, Any]
-    free_run: Any
+    free_run: Criterion
 
     @property
     def learns(self) -> bool:
@@ -215,7 +222,7 @@ class _FocusChoice:
         return len(self.first.theta) + self.first.model.form.bound.size
 
     @cached_property
-    def free(self) -> Any:
+    def free(self) -> Estimate:
         """The fit on the free run, from one start, for all begin at physics alone.
 
         Small problems are trained to the end, large ones within the limit, to save time.
@@ -227,14 +234,14 @@ class _FocusChoice:
         return self.fit(self.problem, criterion=self.free_run, **chosen)
 
     @cached_property
-    def free_physics(self) -> Any:
+    def free_physics(self) -> Estimate:
         """Physics alone on the free run."""
         if "free" in vars(self) and self.free.physics_alone is not None:
             return self.free.physics_alone
         chosen = {**self.options, "learner": None, "fallback": False, "blocks": 0, "restarts": 1}
         return self.fit(self.problem, criterion=self.free_run, **chosen)
 
-    def estimate(self, key: Key) -> Any:
+    def estimate(self, key: Key) -> Estimate:
         """Return the estimate of a candidate from all rows."""
         focus, learner = key
         if focus == ONE_STEP:
@@ -273,7 +280,7 @@ class _FocusChoice:
         except InputError:
             return [(self.problem.record, self.problem.record)]
 
-    def _quick_fit(self, training: Record, criterion: Any) -> Any:
+    def _quick_fit(self, training: Record, criterion: Criterion) -> Any:
         solver = fold_solver(
             self.options["solver"], _rows(training), self.size, free_run=criterion is self.free_run
         )
@@ -284,14 +291,14 @@ class _FocusChoice:
             return None
 
 
-def _drop_learner(estimate: Any, learner: bool) -> Any:
+def _drop_learner(estimate: Estimate, learner: bool) -> Estimate:
     """Return an estimate, or that of its physics alone."""
     if learner or estimate is None or estimate.physics_alone is None:
         return estimate
     return estimate.physics_alone
 
 
-def _best_estimate(choosing: _FocusChoice, reason: str) -> Any:
+def _best_estimate(choosing: _FocusChoice, reason: str) -> Estimate:
     """Return the estimate of the candidate with the least error.
 
     Only candidates whose free run over all rows is sound count.

@@ -269,7 +269,7 @@ class FreeRunTask(SimulationTask):
         plan, measured = self.plan, objective.initial.measured
         places: list[StartPoint] = []
 
-        def add(p: Vector, states: Any = measured, silent: bool = False) -> None:
+        def add(p: Vector, states: np.ndarray = measured, silent: bool = False) -> None:
             loss = objective.evaluate(p, Start(states)).loss
             places.append(StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silent))
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import first_words
 from orthaug.data.regressors import Features
 from orthaug.models.learners import Learner, NoLearner, learns
 from orthaug.models.terms import Terms
@@ -66,11 +67,8 @@ def _independent_columns(columns: np.ndarray, first: int) -> tuple[list[int], li
 
 
 def _warning(gone: list[str]) -> Warning:
-    named = ", ".join(gone[:_NAMED]) + (
-        f" and {len(gone) - _NAMED} more" if len(gone) > _NAMED else ""
-    )
     text = (
-        f"left out of the learner: {named}. On these data the physics, or the terms before, "
-        f"express {'them' if len(gone) > 1 else 'it'} already."
+        f"left out of the learner: {first_words(gone, _NAMED)}. On these data the physics, or the "
+        f"terms before, express {'them' if len(gone) > 1 else 'it'} already."
     )
     return Warning("terms_left_out", text)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray, ArrayModule
 from orthaug.fitting.segments import Sensitivity
 
 _UNSEEN = 1e-12  # of the largest curvature: a combination of states that no output shows
@@ -98,7 +99,7 @@ def _solve_shown(inner: Any, right: Any) -> Any:
 
 
 def without_states(
-    shared: Any, own: Any, missed: Any, prior: Any, xp: Any, solve: Any = None
+    shared: Any, own: Any, missed: AnyArray, prior: AnyArray, xp: ArrayModule, solve: Any = None
 ) -> tuple[Any, Any, Any, Any]:
     """Return the normal equations of (c, w), and offset and slope of the states.
 

@@ -193,9 +193,7 @@ def linearise(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> tuple[Lo
 
     None where no point is finite.
     """
-    scored = np.moveaxis(np.asarray(plan.segments.scored), -1, 1)
-    x = np.moveaxis(plan.runs(c, w, states), -1, 1)[scored]
-    rows = np.moveaxis(np.asarray(plan.segments.inputs), -1, 1)[scored]
+    x, rows = plan.steps(c, w, states)
     kept = np.isfinite(x).all(axis=1)
     x, rows = x[kept], rows[kept]
     if not len(x):

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
+from orthaug._base.jax import AnyArray
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.solvers.limit import Tail
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -66,6 +68,32 @@ class TrainedLearner:
     """True if it is a function from another toolbox."""
 
 
+class PlannedRun(NamedTuple):
+    """One run to be made: its seed, initial weights and regularization."""
+
+    seed: int
+    weights: AnyArray
+    regularization: str | float
+
+
+class FinishedRun(Protocol):
+    """A run as it ended: `TrainingRun` and `FreeRunFit`."""
+
+    @property
+    def ending(self) -> Ending: ...
+
+    @property
+    def iterations(self) -> int: ...
+
+    @property
+    def seconds(self) -> float: ...
+
+    @property
+    def effective(self) -> float:
+        """Effective number of weights."""
+        ...
+
+
 @runtime_checkable
 class Task(Protocol):
     """A problem prepared for training on one criterion; `OneStepTask` and `FreeRunTask`."""
@@ -107,22 +135,19 @@ class Task(Protocol):
         """Return the task without a learner, and the residual of physics alone."""
         ...
 
-    def prepare(self, solver: Any, structure: Structure, progress: RunProgress = quiet) -> Task:
+    def prepare(self, solver: Solver, structure: Structure, progress: RunProgress = quiet) -> Task:
         """Return the task with physics alone trained: all runs start from it."""
         ...
 
     def run(
         self,
-        solver: Any,
+        solver: Solver,
         w: Any,
         structure: Structure,
         regularization: str | float = "none",
         progress: RunProgress = quiet,
-    ) -> Any:
-        """Return one run from the weights `w`, with `ending`, `iterations` and `seconds`.
-
-        Arguments as in `estimate`.
-        """
+    ) -> FinishedRun:
+        """Return one run from the weights `w`; arguments as in `estimate`."""
         ...
 
     def loss(self, run: Any) -> float:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import Warning
@@ -57,7 +57,7 @@ class MotionEstimate(Estimate):
     segmented: SegmentedMotion = field(repr=False)
     states: Any = field(repr=False)
     """The segments' starts, as estimated."""
-    slope: Any = field(repr=False)
+    slope: Float[np.ndarray, "k m nx n"] | None = field(repr=False)
     """How they follow the unknowns (k, m, nx, n), less its sign; None where that is not known."""
     alone: Vector = field(repr=False)
     """The coordinates of physics alone, where the nearest physics is searched from."""
@@ -175,7 +175,7 @@ class MotionEstimate(Estimate):
 
 def fitted_numbers(numbers: Numbers) -> Numbers:
     """Return the numbers before any split: θ is the one fitted beside the learner."""
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
 
 
@@ -184,7 +184,7 @@ def _with_split(
 ) -> MotionEstimate:
     """Return the estimate with p̂, intervals and warnings of a split."""
     motion, numbers = fit.problem.motion, fit.model.numbers
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     bounds = motion.coordinates.bounds
     values = motion.coordinates.physical(split.q)
     at_bound = {
@@ -264,7 +264,7 @@ def free_covariance(
     statistics = fit.model.statistics if statistics is None else statistics
     if statistics.gram is None or statistics.middle is None:
         return None
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     low, high = fit.problem.motion.coordinates.bounds
     moves = np.concatenate(
         [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]

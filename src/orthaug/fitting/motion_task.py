@@ -25,7 +25,7 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.fitting.segmented_motion import MotionObjective, SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.segments import respond
 from orthaug.fitting.simulation_task import SimulationTask, StartPoint
@@ -388,7 +388,7 @@ class MotionTask(SimulationTask):
 
     def places(
         self,
-        objective: Any,
+        objective: MotionObjective,
         solver: LevenbergMarquardt,
         w: Vector,
         structure: Structure,

@@ -26,11 +26,13 @@ from orthaug._base.progress import LOG
 from orthaug.fitting.colour import burg
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.independent_terms import independent_terms
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.noise import ARMA
 from orthaug.fitting.output_noise import LAGS, LEVEL
 from orthaug.fitting.solvers.limit import Limit
 from orthaug.fitting.solvers.minimize import minimize
+from orthaug.fitting.structures import Structure
 from orthaug.fitting.whiteness import ljung_box
 from orthaug.inference.covariance import mixing_matrix
 from orthaug.inference.influence import LARGEST, one_step_slopes
@@ -52,7 +54,13 @@ _MANY = 300_000  # entries of the derivatives: with more, orders are chosen with
 
 
 def check_noise(
-    problem: Any, solver: Any, structure: Any, criterion: Criterion, engine: Any, *, ensemble: bool
+    problem: Problem,
+    solver: Solver,
+    structure: Structure,
+    criterion: Criterion,
+    engine: Any,
+    *,
+    ensemble: bool,
 ) -> None:
     """Raise InputError where a noise model cannot be estimated with what is asked for."""
     if criterion.free_run is not None:

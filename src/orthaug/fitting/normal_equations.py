@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug.models.learners import Bound
 from orthaug.models.rows import Chunk, Engine, Overlap, gram, row_sum
 
@@ -124,7 +124,7 @@ class SummedOneStep:
     rows: Any
     hold: Hold
 
-    def __call__(self, w: Any, before: Overlap) -> Normal:
+    def __call__(self, w: AnyArray, before: Overlap) -> Normal:
         """Return the normal equations at w; `before` is the overlap from the previous pass."""
         return _collect(
             self.engine.sum(Blocks(self.bound), self.rows, w, before), self.hold, before

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray
 from orthaug.fitting.colour import independent_share, share_of, spectrum_size
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.segment_sums import SegmentSums
@@ -177,7 +178,7 @@ class FreeRunObjective:
         return linear.information
 
     def errors(
-        self, c: Vector, w: Vector, states: Any, segments: Segments
+        self, c: Vector, w: Vector, states: AnyArray, segments: Segments
     ) -> Float[np.ndarray, "k T ny m"]:
         """Return the errors of every segment from its state, in the outputs' units.
 
@@ -253,7 +254,7 @@ class FreeRunObjective:
 
 
 def errors_of(
-    dynamics: Dynamics, numbers: Numbers, states: Any, segments: Segments
+    dynamics: Dynamics, numbers: Numbers, states: AnyArray, segments: Segments
 ) -> Float[np.ndarray, "k T ny m"]:
     """Return the errors of every segment from its state, in the outputs' units.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import jnp
+from orthaug._base.jax import Array, jnp
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
@@ -19,6 +19,7 @@ from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.conclusion import conclude
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.elimination import Elimination, Fixed, eliminate, split_theta
+from orthaug.fitting.kinds import Solver
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Hold, OneStep, SummedOneStep, linearise
@@ -132,7 +133,7 @@ class OneStepTask(TrainingRows):
         return OneStepTask.of(self.problem.on(record), self.bound.learner, engine=self.engine)
 
     def prepare(
-        self, solver: Any, structure: Structure, progress: RunProgress = quiet
+        self, solver: Solver, structure: Structure, progress: RunProgress = quiet
     ) -> OneStepTask:
         """Return the task with the loss of physics alone under the structure's rows and bounds.
 
@@ -166,7 +167,7 @@ class OneStepTask(TrainingRows):
 
     def run(
         self,
-        solver: Any,
+        solver: Solver,
         w: Any,
         structure: Structure | None = None,
         regularization: str | float = "none",
@@ -212,8 +213,8 @@ class OneStepTask(TrainingRows):
 
     def _run_inside(
         self,
-        solver: Any,
-        w: Any,
+        solver: Solver,
+        w: Array,
         structure: Structure,
         elimination: Elimination,
         regularization: str | float,
@@ -251,8 +252,8 @@ class OneStepTask(TrainingRows):
 
     def _run_held(
         self,
-        solver: Any,
-        w: Any,
+        solver: Solver,
+        w: Array,
         structure: Structure,
         elimination: Elimination,
         fixed: Fixed,
@@ -294,7 +295,7 @@ class OneStepTask(TrainingRows):
         )
 
     def _joint_least_squares(
-        self, solver: Any, w: Any, physics: Physics, progress: RunProgress
+        self, solver: Solver, w: Any, physics: Physics, progress: RunProgress
     ) -> GradientRun:
         """Run Levenberg-Marquardt over θ, from θ⁰, and the weights together."""
         nt = len(physics.outputs)

@@ -37,8 +37,8 @@ def _evaluate(
     That is 1 at the limit of the training data.
     """
 
-    def one(row: Any) -> Any:
-        phi = form.baseline.phi(row, form.layout, form.outputs, jnp)
+    def one(row: Array) -> Array:
+        phi = form.phi(row)
         known = form.baseline.known(row, form.layout, form.outputs, jnp)
         added = known + form.at(numbers, row).learner
         reach = jnp.zeros_like(added)

@@ -16,7 +16,7 @@ from orthaug.fitting.residual_band import Reference, ResidualMonitor
 from orthaug.models import storage
 from orthaug.models.learners import Learner
 from orthaug.models.model import Model
-from orthaug.models.packed_files import pack, read_packed, write_packed
+from orthaug.models.packed_files import has_files, pack, read_packed, write_packed
 from orthaug.physics.baseline import Baseline
 
 FORMAT = 1
@@ -85,13 +85,7 @@ def load(folder: Any, baseline: Baseline | None, learner: Learner | None) -> Rec
     """
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
-    try:
-        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
-    except ValueError:  # a NUL byte in the name
-        there = False
-    if not there:
+    if not has_files(folder, _DECLARATION, _ARRAYS):
         raise InputError(
             f"{folder}: no saved recursive estimate there; expected {_DECLARATION} and {_ARRAYS}."
         )

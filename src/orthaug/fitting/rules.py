@@ -16,6 +16,7 @@ from orthaug.fitting.structures import Structure
 from orthaug.models.learners import Learner, learns, remembers
 from orthaug.models.rows import Room
 from orthaug.physics.motion import Motion
+from orthaug.physics.problem import PosedProblem
 
 LONGEST_FIT = 30 * 86400.0  # s
 _RATE, _STEP = 2e10, 2e-4  # products per second and core; seconds of an iteration at least
@@ -111,7 +112,7 @@ def choose_regularizations(
     given: Any,
     solver: Solver,
     criterion: Criterion,
-    structure: Any,
+    structure: Structure,
     *,
     linear: bool,
     validated: bool,
@@ -187,7 +188,7 @@ def check_motion_choices(
         )
 
 
-def check_joint(solver: Any, ridge: float, evidence: bool, *, resident: bool) -> None:
+def check_joint(solver: Solver, ridge: float, evidence: bool, *, resident: bool) -> None:
     """Raise InputError for options that need θ solved, or normal equations, one step ahead."""
     if solver.gauss_newton and (ridge or not resident):  # evidence starts with a ridge
         what = "regularization" if ridge else "training on rows that are not in memory"
@@ -248,7 +249,9 @@ def check_cost(
         )
 
 
-def check_sizes(problem: Any, learner: Any, *, iterations: int, runs: int, room: Any) -> None:
+def check_sizes(
+    problem: PosedProblem, learner: Learner | None, *, iterations: int, runs: int, room: Room | None
+) -> None:
     """Raise InputError for a fit that would take more memory or time than there is.
 
     Args:

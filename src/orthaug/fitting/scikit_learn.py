@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from orthaug._base.checks import check_count, nearest
+from orthaug._base.checks import check_count, free_name, nearest
 from orthaug._base.errors import InputError, TrainingError, show
 from orthaug._base.jax import jax
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, is_name
@@ -196,7 +196,7 @@ def input_names(estimator: Any) -> tuple[str, ...]:
     """
     given = getattr(estimator, "feature_names_in_", [""] * estimator.n_features_in_)
     good = [str(name) if is_name(str(name)) else "" for name in given]
-    return tuple(name or _free_name(f"x{j}", good) for j, name in enumerate(good))
+    return tuple(name or free_name(f"x{j}", good) for j, name in enumerate(good))
 
 
 def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]:
@@ -215,13 +215,7 @@ def output_names(y: Any, columns: int, inputs: Sequence[str]) -> tuple[str, ...]
         is_name(n) and n not in (*inputs, *_TAKEN, "None") for n in named
     ):
         return tuple(named)
-    return tuple(_free_name("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
-
-
-def _free_name(name: str, taken: Sequence[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
+    return tuple(free_name("y" if columns == 1 else f"y{j}", inputs) for j in range(columns))
 
 
 def at_now(text: str, names: Sequence[str]) -> str:
@@ -278,7 +272,7 @@ def baseline_of(
         line = {
             (f"{lag.channel}_{lag.lag}" if lag.lag else lag.channel): str(lag) for lag in layout
         }
-        physics = {_free_name("intercept", [*line]): "1"} | line
+        physics = {free_name("intercept", [*line]): "1"} | line
     elif (
         not isinstance(physics, str)
         and isinstance(physics, Sequence)

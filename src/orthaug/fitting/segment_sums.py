@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jnp
+from orthaug._base.jax import AnyArray, Array, jnp
 from orthaug.fitting.initial_states import InitialStates, Start, without_states
 from orthaug.fitting.segments import Segments, chunk_response, chunk_sensitivity
 from orthaug.models.dynamics import Dynamics, Numbers
@@ -27,9 +27,9 @@ _KEPT = 4  # layouts of a record: its own, and lengths of the segments on the wa
 class Best(NamedTuple):
     """States of a chunk's segments, and the derivative of the best ones by (c, w)."""
 
-    values: Float[Any, "n0 m"]
-    offset: Float[Any, "m n0"]
-    slope: Float[Any, "m n0 n"]
+    values: Float[AnyArray, "n0 m"]
+    offset: Float[AnyArray, "m n0"]
+    slope: Float[AnyArray, "m n0 n"]
 
     def moved(self, step: Any) -> Float[Array, "n0 m"]:
         """Return the best states where (c, w) has moved by `step` (n,)."""
@@ -39,8 +39,8 @@ class Best(NamedTuple):
 class Squares(NamedTuple):
     """Sums of a trial: `‖r‖²` of errors and states, and Σ e eᵀ (ny, ny) in outputs' units."""
 
-    misfit: Any
-    errors: Any
+    misfit: AnyArray
+    errors: AnyArray
 
 
 def _errors(

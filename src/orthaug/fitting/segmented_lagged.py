@@ -229,7 +229,7 @@ class StructuredObjective(FreeRunObjective):
         nt, nw = slope.shape
         return np.block([[np.eye(nt), -slope], [np.zeros((nw, nt)), np.eye(nw)]])
 
-    def _theta_taken(self, share: Any) -> Any:
+    def _theta_taken(self, share: np.ndarray) -> np.ndarray:
         """Return θ_aux of the learner's share QᵀF, or of its derivative."""
         return self.task.problem.projection.from_coordinates(self._projector @ share)
 

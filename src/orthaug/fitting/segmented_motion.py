@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, quick_jit
+from orthaug._base.jax import AnyArray, Array, jax, quick_jit
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
@@ -98,7 +98,7 @@ class SegmentedMotion(SegmentedProblem):
             like=like,
         )
 
-    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+    def numbers(self, c: AnyArray, w: Any, tilt: Any = None) -> Numbers:
         numbers = super().numbers(c, w, tilt)
         return (
             numbers if self.predictor is None else numbers._replace(correction=self.predictor.gain)
@@ -232,17 +232,20 @@ class SegmentedMotion(SegmentedProblem):
             mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
         return mean if mean < RUNAWAY else np.nan
 
-    def runs(self, c: Vector, w: Any, states: Any) -> Float[np.ndarray, "k T n0 m"]:
+    def runs(self, c: AnyArray, w: Any, states: np.ndarray) -> Float[np.ndarray, "k T n0 m"]:
         """Return the states along every segment from these starts."""
         return np.asarray(_states(self.dynamics, self.numbers(c, w), self.segments, states))
 
-    def trajectory(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
+    def trajectory(self, c: Vector, w: Any, states: np.ndarray) -> tuple[Matrix, Matrix]:
         """Return states (N, nx) and inputs (N, nu) of the segments' runs, on scored rows."""
-        runs = self.runs(c, w, states)
+        x, inputs = self.steps(c, w, states)
+        return x, self.dynamics.at_samples(self.numbers(c, w), x, inputs)
+
+    def steps(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
+        """Return states (N, nx) of the segments' runs and inputs of their steps, on scored rows."""
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
-        states = np.moveaxis(runs, -1, 1)[scored]
-        return states, self.dynamics.at_samples(self.numbers(c, w), states, inputs)
+        return np.moveaxis(self.runs(c, w, states), -1, 1)[scored], inputs
 
     @property
     def _washout(self) -> int:
@@ -262,7 +265,7 @@ class SegmentedMotion(SegmentedProblem):
         segments = np.repeat(self.record.recordings, [len(begins) for begins in self._begins])
         return np.repeat(segments, counts[: len(segments)])
 
-    def states_by_row(self, c: Vector, w: Any, states: Any) -> list[Matrix]:
+    def states_by_row(self, c: Vector, w: Any, states: np.ndarray) -> list[Matrix]:
         """Return the states (N, nx) of every experiment, joined from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
@@ -294,12 +297,12 @@ def sizes(problem: MotionProblem) -> Vector:
 @partial(quick_jit, static_argnames="form")
 def _states(
     form: MotionDynamics, numbers: Numbers, segments: Segments, states: Float[Array, "k n0 m"]
-) -> Any:
+) -> Array:
     """Return the states (k, T, n0, m) of every segment's run."""
     numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 
-    def one_chunk(chunk: Any) -> Any:
+    def one_chunk(chunk: Any) -> Array:
         return jax.lax.scan(lambda state, row: (side_by_side(state, row), state), *chunk)[1]
 
     return jax.lax.map(one_chunk, (states, segments.inputs))

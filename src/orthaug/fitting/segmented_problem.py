@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
@@ -57,7 +59,7 @@ class TrialInMemory(NamedTuple):
 
     objective: FreeRunObjective
     point: TrialPoint
-    slope: Any
+    slope: Float[np.ndarray, "k m n0 n"] | None
 
 
 class Layout(NamedTuple):
@@ -141,12 +143,16 @@ class SegmentedProblem:
         """Number of scored errors."""
         return self.segments.count * len(self.dynamics.outputs)
 
-    def numbers(self, c: Vector, w: Any, tilt: Any = None) -> Numbers:
+    def numbers(self, c: AnyArray, w: Vector, tilt: Any = None) -> Numbers:
         """Return the model's numbers before the split."""
         scaling = self.scaling
         return Numbers(
             c, np.zeros_like(c), np.asarray(w), scaling.centre, scaling.halfwidth, self.unit, tilt
         )
+
+    def reporting(self, progress: RunProgress) -> RunProgress:
+        """Return the progress of a run whose losses are sums of squares in this unit."""
+        return lambda iteration, loss: progress(iteration, loss * self.rms**2 / self.residuals)
 
     def descend(
         self,
@@ -154,7 +160,7 @@ class SegmentedProblem:
         p: Vector,
         solver: LevenbergMarquardt,
         progress: RunProgress = quiet,
-        states: Any = None,
+        states: np.ndarray | None = None,
         **options: Any,
     ) -> FreeRunFit:
         """Descend from p to the end of the run.
@@ -238,7 +244,7 @@ class SegmentedProblem:
             else noise_covariance(squares, np.full(ny, self.segments.count - used))
         )
 
-    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+    def mean_square(self, c: Vector, w: Vector, tilt: Any = None) -> float:
         """Return the mean of squared errors over whole experiments.
 
         Outputs in their deviations.

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from orthaug._base.jax import Array, jax, jnp, quick_jit
+from orthaug._base.checks import Matrix
+from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers
 from orthaug.models.rows import gram
@@ -30,11 +31,11 @@ class Segments(NamedTuple):
     Steps that are not scored may be padding.
     """
 
-    start: Float[Any, "k n0 m"]
+    start: Float[AnyArray, "k n0 m"]
     """The state before the first step, as it was measured."""
-    inputs: Float[Any, "k T nu m"]
-    target: Float[Any, "k T ny m"]
-    scored: Bool[Any, "k T m"]
+    inputs: Float[AnyArray, "k T nu m"]
+    target: Float[AnyArray, "k T ny m"]
+    scored: Bool[AnyArray, "k T m"]
 
     @property
     def count(self) -> int:
@@ -100,7 +101,7 @@ def begins_of(rows: int, steps: int, washout: int) -> list[int]:
 
 
 def segment_of(
-    experiment: Experiment, inputs: Any, begin: int, steps: int, washout: int, dynamics: Dynamics
+    experiment: Experiment, inputs: Matrix, begin: int, steps: int, washout: int, dynamics: Dynamics
 ) -> Segments:
     """Return one segment. Where the experiment is shorter, its last row is repeated."""
     rows = np.arange(begin, begin + steps)
@@ -123,12 +124,12 @@ def respond(
 
 
 def chunk_response(
-    dynamics: Dynamics, numbers: Numbers, states: Any, inputs: Any
+    dynamics: Dynamics, numbers: Numbers, states: Array, inputs: Any
 ) -> Float[Array, "T ny m"]:
     """Return outputs of the segments of one chunk, of prepared numbers."""
     side_by_side = jax.vmap(partial(dynamics.step, numbers), in_axes=-1, out_axes=-1)
 
-    def step(state: Any, inputs: Any) -> tuple[Any, Any]:
+    def step(state: Array, inputs: Array) -> tuple[Any, Any]:
         state, parts = side_by_side(state, inputs)
         return state, parts.total
 
@@ -162,7 +163,7 @@ def sensitivity(
     numbers = dynamics.prepare(numbers)
     n = dynamics.unknowns
 
-    def one_chunk(total: Any, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
+    def one_chunk(total: Array, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
         shared, own = chunk_sensitivity(dynamics, numbers, chunk, weight)
         return total + shared, own
 
@@ -186,7 +187,7 @@ def chunk_sensitivity(
     )
 
 
-def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
+def _columns(scored: Array, slope: Array, error: Array, weight: Array) -> Array:
     """Return derivatives and error of scored steps side by side (ny, n0 + n + 1, …).
 
     Rows are multiplied by `weight`.
@@ -200,7 +201,7 @@ def _columns(scored: Any, slope: Any, error: Any, weight: Any) -> Any:
 
 
 def _step_by_step(
-    dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Any
+    dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Array
 ) -> tuple[Any, Any]:
     """Return Gram matrices of one chunk, for dynamics that can carry derivatives."""
     n0 = dynamics.states
@@ -218,7 +219,7 @@ def _step_by_step(
 
 
 def _steps_at_once(
-    most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Any
+    most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Array
 ) -> tuple[Any, Any]:
     """Return Gram matrices of one chunk, a block of steps at a time.
 
@@ -246,7 +247,7 @@ def _steps_at_once(
         own_slopes = jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0), (0, 0)))
         by_step = (jnp.moveaxis(part[:n0], -2, 0) for part in (to_state, own_slopes))
 
-        def follow(slopes: Any, row: Any) -> tuple[Any, Any]:
+        def follow(slopes: Array, row: Any) -> tuple[Any, Any]:
             to_state, beside = row
             return sum(to_state[:, i, None] * slopes[None, i] for i in range(n0)) + beside, slopes
 
@@ -302,7 +303,7 @@ def block_scores(
             sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0)),
         ), None
 
-    def one_chunk(chunk: tuple[Any, ...]) -> Any:
+    def one_chunk(chunk: tuple[Any, ...]) -> Array:
         state, *rows = chunk
         start = (state, dynamics.first_slopes(width), jnp.zeros((blocks, n0 + n, width)))
         return jax.lax.scan(step, start, (*rows, place))[0][2]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.structures import Orthogonal, Structure
+from orthaug.fitting.structures import Orthogonal, Structure, with_measure
 from orthaug.inference.measures import Training
 from orthaug.models.learners import Learner, learns
 
@@ -70,7 +70,7 @@ class TrainingSetup:
         """
         options = self._options(
             learner=None if physics_only else self.learner,
-            structure=Orthogonal() if physics_only else _without_measure(self.structure),
+            structure=Orthogonal() if physics_only else with_measure(self.structure, Training()),
             criterion=criterion,
         )
         options.pop("engine", None)  # a fold is small: its rows are in memory
@@ -96,12 +96,6 @@ def quick_options(options: Mapping[str, Any]) -> dict[str, Any]:
         "blocks": 0,
         "validation": None,
     }
-
-
-def _without_measure(structure: Any) -> Any:
-    """Return a structure under the training measure."""
-    takes = any(field.name == "measure" for field in fields(structure))
-    return replace(structure, measure=Training()) if takes else structure
 
 
 def _fit_fold(

@@ -17,7 +17,7 @@ import numpy as np
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug.fitting.held_out import HeldOutErrors, mean_square
-from orthaug.fitting.learned import TrainedLearner
+from orthaug.fitting.learned import FinishedRun, PlannedRun, TrainedLearner
 from orthaug.fitting.solvers.minimize import evidence_ridge
 from orthaug.fitting.status import Ending
 
@@ -32,11 +32,11 @@ def is_silenced(effective: float, outputs: int) -> bool:
 
 
 def add_retries(
-    starts: list[Any],
-    runs: list[Any],
+    starts: list[PlannedRun],
+    runs: list[FinishedRun],
     outputs: int,
-    make: Callable[[list[Any]], tuple[list[Any], list[Any]]],
-) -> tuple[list[Any], list[Any]]:
+    make: Callable[[list[PlannedRun]], tuple[list[PlannedRun], list[Any]]],
+) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return the planned runs with their ends, and runs that were added.
 
     The latter have weaker regularizations, where evidence silenced all others.
@@ -64,7 +64,9 @@ def found_ridge(run: Any) -> float:
     return float(f"{evidence_ridge(run.objective, run.end.point, run.effective):.3g}")
 
 
-def fold_ridges(starts: Sequence[Any], runs: Sequence[Any], outputs: int) -> list[float | None]:
+def fold_ridges(
+    starts: Sequence[PlannedRun], runs: Sequence[Any], outputs: int
+) -> list[float | None]:
     """Return for each run the ridge with which a fold makes it again where evidence silences it.
 
     Evidence may silence the learner on three of four folds and not on all rows. Such folds say
@@ -83,8 +85,8 @@ def fold_ridges(starts: Sequence[Any], runs: Sequence[Any], outputs: int) -> lis
 
 def retry_warnings(
     planned: int,
-    starts: Sequence[Any],
-    runs: Sequence[Any],
+    starts: Sequence[PlannedRun],
+    runs: Sequence[FinishedRun],
     held_out: HeldOutErrors | None,
     best: int,
 ) -> list[Warning]:

@@ -22,7 +22,7 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.rules import ridge_of
-from orthaug.fitting.segmented_problem import FreeRunFit
+from orthaug.fitting.segmented_problem import FreeRunFit, SegmentedProblem
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.minimize import LEARNED, Descent
 from orthaug.fitting.structures import Structure
@@ -36,7 +36,7 @@ class StartPoint(NamedTuple):
     """A possible start of a run: p, the segments' states, the loss, a silent learner or not."""
 
     p: Vector
-    states: Any
+    states: np.ndarray
     loss: float
     silent: bool
 
@@ -70,7 +70,7 @@ class SimulationTask(ABC):
     ) -> tuple[Any, FreeRunFit | None]:
         """Return the problem and physics alone trained on it; None where no run is finite."""
 
-    def scaled(self, plan: Any, physics: FreeRunFit) -> Any:
+    def scaled(self, plan: SegmentedProblem, physics: FreeRunFit) -> SegmentedProblem:
         """Return the problem with its learner scaled by the run of physics alone."""
         return plan
 
@@ -93,12 +93,7 @@ class SimulationTask(ABC):
         Its errors are then the unit of the criterion, in which a ridge counts. Where it runs away
         over whole experiments, runs are compared over segments.
         """
-        own = self.plan
-
-        def report(iteration: int, loss: float) -> None:
-            progress(iteration, loss * own.rms**2 / own.residuals)
-
-        plan, physics = self.train_physics_only(solver, structure, report)
+        plan, physics = self.train_physics_only(solver, structure, self.plan.reporting(progress))
         if physics is None:
             return self
         rms = plan.rms * float(np.sqrt(physics.end.point.misfit / plan.residuals))
@@ -177,9 +172,7 @@ class SimulationTask(ABC):
         ):  # one prior deviation of the weights for one of what is left
             ridge = best.loss / plan.residuals
 
-        def report(iteration: int, loss: float) -> None:
-            progress(iteration, loss * plan.rms**2 / plan.residuals)
-
+        report = plan.reporting(progress)
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
         kept = {"ceiling": ceiling}
         first = None

@@ -9,8 +9,8 @@ and its bounds as one small quadratic in `QᵀF` (`fitting.elimination`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Literal, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from annotated_types import Ge
@@ -190,3 +190,9 @@ class BaselinePenalty(_SolvedTheta):
             np.zeros((len(names), len(names))),
             root * np.ones(len(names)),
         )
+
+
+def with_measure(structure: Any, measure: Measure) -> Any:
+    """Return a structure under a measure, where it splits θ."""
+    takes = any(field.name == "measure" for field in fields(structure))
+    return replace(structure, measure=measure) if takes else structure

@@ -6,18 +6,18 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import finite_or_none
+from orthaug._base.checks import Vector, finite_or_none
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
 from orthaug._base.progress import LOG, ProgressCallback, Stage, show_model
 from orthaug.data.record import Record
-from orthaug.fitting.estimates import Restart
+from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
@@ -26,13 +26,14 @@ from orthaug.fitting.held_out import (
     squared_errors,
 )
 from orthaug.fitting.kinds import Solver
-from orthaug.fitting.learned import Task, TrainedLearner
+from orthaug.fitting.learned import FinishedRun, PlannedRun, Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.setup import FOLD_ITERATIONS
 from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry_warnings
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
+from orthaug.models.rows import Engine
 
 # of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
 _INFLATION = 1.4
@@ -53,14 +54,6 @@ def fold_solver(solver: Solver, rows: int, parameters: int, *, free_run: bool) -
     """
     affordable = int(_FOLD_WORK / max(rows * parameters, 1)) if free_run else 0
     return solver.at_most(max(FOLD_ITERATIONS, affordable))
-
-
-class PlannedRun(NamedTuple):
-    """One run to be made: its seed, initial weights and regularization."""
-
-    seed: int
-    weights: Any
-    regularization: str | float
 
 
 def plan_runs(bound: Bound, seeds: range, choices: Sequence[str | float]) -> list[PlannedRun]:
@@ -106,7 +99,9 @@ class Choice:
             task.criterion.free_run is not None or (several and not self.scored)
         )
 
-    def ranking(self, task: Task, runs: Sequence[Any], errors: Sequence[float]) -> np.ndarray:
+    def ranking(
+        self, task: Task, runs: Sequence[FinishedRun], errors: Sequence[float]
+    ) -> np.ndarray:
         """Return the value that is lowest for the best run: held-out error, score, or loss.
 
         On blocks other runs of its kind were judged: one that ended higher on its own data than
@@ -126,8 +121,8 @@ def train(
     solver: Solver,
     choice: Choice,
     progress: ProgressCallback,
-    runner: Any = Threads(),  # noqa: B008  (it holds nothing)
-) -> Any:
+    runner: Engine | Threads = Threads(),  # noqa: B008  (it holds nothing)
+) -> Estimate:
     """Run from every start and conclude with the best.
 
     Args:
@@ -200,7 +195,7 @@ def train(
     return replace(estimate, **found, warnings=warnings)
 
 
-def _physics_to_compare(task: Task, structure: Structure) -> Any:
+def _physics_to_compare(task: Task, structure: Structure) -> Estimate | None:
     """Return the estimate of physics alone, to compare with that of a learner.
 
     It is least squares one step ahead, also where θ has a penalty. None without a learner, and
@@ -213,7 +208,13 @@ def _physics_to_compare(task: Task, structure: Structure) -> Any:
 
 
 def _restart(
-    start: PlannedRun, run: Any, loss: float, error: float, score: float, *, chosen: bool
+    start: PlannedRun,
+    run: FinishedRun,
+    loss: float,
+    error: float,
+    score: float,
+    *,
+    chosen: bool,
 ) -> Restart:
     return Restart(
         seed=start.seed,
@@ -227,7 +228,7 @@ def _restart(
     )
 
 
-def _cross_validation(task: Task, run: Any) -> float:
+def _cross_validation(task: Task, run: FinishedRun) -> float:
     """Return the score `N RSS / (N − nθ − 1.4 γ)²` of a run one step ahead (generalised).
 
     Infinite where it uses up all rows.
@@ -252,8 +253,8 @@ def _run_all(
     solver: Solver,
     choice: Choice,
     progress: ProgressCallback,
-    runner: Any,
-) -> tuple[list[PlannedRun], list[Any]]:
+    runner: Engine | Threads,
+) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Make every planned run, and weaker regularizations where evidence silenced the learner.
 
     The latter only where held-out rows can choose.
@@ -262,7 +263,7 @@ def _run_all(
     if not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
-    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[Any]]:
+    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[FinishedRun]]:
         return _run(
             task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
         )
@@ -276,8 +277,8 @@ def _run(
     structure: Structure,
     solver: Solver,
     progress: ProgressCallback,
-    runner: Any,
-) -> tuple[list[PlannedRun], list[Any]]:
+    runner: Engine | Threads,
+) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return every planned run; one that fails is made again from the seeds that follow."""
     made, given, record = list(starts), (task, solver, structure), task.problem.record
     runs: list[Any] = []
@@ -310,12 +311,14 @@ def _conclude_briefly(task: Task, structure: Structure, run: Any) -> Any:
 
 def _one_run(
     given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
-) -> Any:
+) -> FinishedRun:
     task, solver, structure = given
     return task.run(solver, start.weights, structure, start.regularization, report)
 
 
-def _replacement_warnings(starts: Sequence[PlannedRun], runs: Sequence[Any]) -> list[Warning]:
+def _replacement_warnings(
+    starts: Sequence[PlannedRun], runs: Sequence[FinishedRun]
+) -> list[Warning]:
     failed = [
         str(start.seed) for start, run in zip(starts, runs, strict=True) if not run.ending.usable
     ]
@@ -343,12 +346,12 @@ def _stop_warnings(count: int, runs: int, untried: bool) -> list[Warning]:
 def _held_out(
     task: Task,
     starts: Sequence[PlannedRun],
-    runs: Sequence[Any],
-    concluded: Callable[[int], Any],
+    runs: Sequence[FinishedRun],
+    concluded: Callable[[int], Estimate],
     structure: Structure,
     solver: Solver,
     choice: Choice,
-    runner: Any,
+    runner: Engine | Threads,
 ) -> HeldOutErrors | None:
     """Return held-out errors: of runs on the validation record, or of runs on folds.
 
@@ -411,7 +414,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
     return [_errors(fit, held, task.problem.deviation) for fit in fits]
 
 
-def _errors(fit: Any, record: Record, unit: Any) -> Pieces:
+def _errors(fit: Estimate, record: Record, unit: Vector) -> Pieces:
     """Return errors of the criterion's own response; None for a run without model or value."""
     if not fit.status.ok:
         return [None] * len(record.experiments)
@@ -437,12 +440,14 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
     return Warning("physics_alone", text)
 
 
-def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Any:
+def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Estimate:
     rows, learned = task.physics_alone()
     return replace(rows.conclude(structure, learned, briefly=briefly), criterion=task.criterion)
 
 
-def _median(task: Task, runs: Sequence[Any], members: Sequence[int], best: int) -> TrainedLearner:
+def _median(
+    task: Task, runs: Sequence[FinishedRun], members: Sequence[int], best: int
+) -> TrainedLearner:
     """Return the median of the members that have a value everywhere.
 
     The best one alone if it has none.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray, Array
 from orthaug.fitting.learned import TrainedLearner
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.inference.covariance import mixing_matrix
@@ -58,7 +59,7 @@ class TrainingRows:
         nt, size = len(self.problem.baseline.names), self.bound.size
         return Overlap(np.zeros((nt, size)), np.zeros(nt))
 
-    def mean_square(self, loss: Any) -> float:
+    def mean_square(self, loss: Array | float) -> float:
         """Return the criterion's `‖r‖²` as a mean of squared errors.
 
         Each output counts in its standard deviation.
@@ -93,7 +94,7 @@ class TrainingRows:
         rest, square = self.engine.sum(summed, self.rows, *self._weights(learned), shift / self.rms)
         return np.asarray(rest) * self.rms, float(square) * self.rms**2
 
-    def values(self, w: Any) -> Float[np.ndarray, "N ny"]:
+    def values(self, w: Vector) -> Float[np.ndarray, "N ny"]:
         """Return f at the training rows in memory, in the outputs' units."""
         if not self.bound.learns:  # nothing to compile
             return np.zeros_like(self.problem.target)
@@ -124,7 +125,7 @@ class TrainingRows:
             return learned.weights, None
         return learned.weights, learned.tilt @ self.problem.projection.to_coordinates.T / self.rms
 
-    def middle(self, w: Any, noise: Matrix) -> Matrix:
+    def middle(self, w: AnyArray, noise: Matrix) -> Matrix:
         """Return ΣψᵀΣ_eψ of `[Φ J]` for the noise covariance of whitened outputs.
 
         One pass over the rows.

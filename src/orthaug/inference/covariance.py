@@ -127,7 +127,7 @@ def reach(freedom: float, level: float = 0.95) -> float:
 
 
 def interval(
-    value: Any, std: Any, freedom: float, level: float = 0.95
+    value: np.ndarray | float, std: np.ndarray | float, freedom: float, level: float = 0.95
 ) -> Float[np.ndarray, "*n 2"]:
     """Return the Student-t interval of each entry, (…, 2)."""
     half = reach(freedom, level) * std
@@ -252,7 +252,7 @@ def changes(
 ) -> Float[Array, "k ro m"]:
     """Return how far each prediction moves along the columns of `root`."""
 
-    def one_chunk(rows: Any) -> Any:
+    def one_chunk(rows: Array) -> Array:
         moved = _slopes_along(form, numbers, rows, root)
         return moved.reshape(-1, moved.shape[-1])
 
@@ -260,10 +260,10 @@ def changes(
 
 
 def _slopes_along(
-    form: LaggedDynamics, numbers: Numbers, rows: Any, root: Any
+    form: LaggedDynamics, numbers: Numbers, rows: Array, root: Array
 ) -> Float[Array, "r ny m"]:
     """Return ∂ŷ/∂(c, w) of a chunk of rows along the columns of `root`."""
-    phi = jax.vmap(lambda row: form.baseline.phi(row, form.layout, form.outputs, jnp), -1, -1)(rows)
+    phi = jax.vmap(lambda row: form.phi(row), -1, -1)(rows)
     columns = jnp.moveaxis(phi, 1, 0)  # (nt, ny, m)
     z = form.features.evaluate(rows.T, form.layout, jnp)
     z = ((z - numbers.centre) / numbers.halfwidth).T

@@ -15,6 +15,7 @@ from orthaug.data.expressions import Expression
 from orthaug.data.terms import outside_brackets
 from orthaug.data.writing import coefficient_unit, latex
 from orthaug.inference.covariance import interval
+from orthaug.models.model import Model
 from orthaug.models.terms import Terms
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class LearnedTerm:
     ci95: tuple[float, float] | None = None
 
 
-def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
+def learned_terms(model: Model) -> tuple[LearnedTerm, ...]:
     """Return the learned terms of a fitted model, the largest contribution first.
 
     Empty where the learner is no sum of terms.
@@ -74,7 +75,7 @@ def learned_terms(model: Any) -> tuple[LearnedTerm, ...]:
     return tuple(sorted(found, key=lambda term: -term.largest))
 
 
-def equation(model: Any, writing: str = "text") -> str:
+def equation(model: Model, writing: str = "text") -> str:
     """Return the fitted model with its numbers, an equation per output or per motion equation.
 
     Args:
@@ -96,23 +97,23 @@ def equation(model: Any, writing: str = "text") -> str:
     written = []
     for left, physics in _physics(model, writing):
         own = [(term.coefficient, term.term) for term in terms if term.added_to == left[0]]
-        pieces = [*physics, *(_product(value, text, writing, model) for value, text in own)]
+        pieces = [*physics, *(_product(value, text, writing) for value, text in own)]
         signed = [f"- {piece[1:]}" if piece.startswith("-") else f"+ {piece}" for piece in pieces]
         total = " ".join(signed).removeprefix("+ ") or "0"
         written.append(f"{left[1]} = {'-' + total[2:] if total.startswith('- ') else total}")
     return "\n".join(written)
 
 
-def _features(model: Any) -> tuple[Expression, ...]:
+def _features(model: Model) -> tuple[Expression, ...]:
     entries = model.form.features
     return entries if isinstance(entries, tuple) else entries.entries
 
 
-def _moves(model: Any) -> bool:
+def _moves(model: Model) -> bool:
     return hasattr(model.form, "motion")
 
 
-def _targets(model: Any) -> list[tuple[str, str]]:
+def _targets(model: Model) -> list[tuple[str, str]]:
     """Return the name and unit of the quantity that each row of weights is added to."""
     if not _moves(model):
         return [(channel.name, channel.unit) for channel in model.outputs]
@@ -129,14 +130,14 @@ def _targets(model: Any) -> list[tuple[str, str]]:
     ]
 
 
-def _units(model: Any) -> dict[str, str]:
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
+def _units(model: Model) -> dict[str, str]:
+    units = model.units
     if _moves(model):
         units |= {state.name: state.unit for state in model.form.motion.states}
     return units
 
 
-def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
+def _physics(model: Model, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
     """Return each equation's name and left side, and its terms of the physics."""
     if _moves(model):
         return _rates(model, writing)
@@ -159,13 +160,13 @@ def _physics(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]
         found.append(
             (
                 (channel.name, left),
-                [_product(value, text, writing, model) for value, text in values],
+                [_product(value, text, writing) for value, text in values],
             )
         )
     return found
 
 
-def _rates(model: Any, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
+def _rates(model: Model, writing: str) -> list[tuple[tuple[str, str], list[str]]]:
     motion = model.form.motion
     if motion.functions is not None:
         raise InputError("the physics are Python functions, which cannot be written as equations.")
@@ -186,7 +187,7 @@ def _expression(text: str, writing: str) -> str:
     return latex(Expression(text)) if writing == "latex" else text
 
 
-def _product(value: float, text: str, writing: str, model: Any) -> str:
+def _product(value: float, text: str, writing: str) -> str:
     number = repr(float(value)) if writing == "python" else f"{value:.6g}"
     if writing == "latex":
         number = _power_of_ten(number)

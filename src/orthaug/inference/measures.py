@@ -279,7 +279,7 @@ class Uniform:
         return low, high
 
 
-def _normalise(weights: Any, count: int, what: str) -> Vector:
+def _normalise(weights: Vector, count: int, what: str) -> Vector:
     try:
         values = np.asarray(weights, dtype=float)
     except (TypeError, ValueError):

@@ -369,7 +369,7 @@ def nearest(
         start: coordinates of physics alone.
         basis: directions to search along; None for those that are shared.
     """
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     q = c
 
     def directions(q: Vector) -> SharedDirections:
@@ -436,7 +436,7 @@ def split_motion(
     """
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
-    c = np.asarray(numbers.theta - numbers.theta_aux)
+    c = np.asarray(numbers.c)
     if not form.learns:
         nothing = SharedDirections(form.motion.names, np.zeros((count, 0)))
         own = {"name": name, "field": field, "slope": np.eye(count)}
@@ -492,11 +492,11 @@ def rest_of(
 
 @partial(quick_jit, static_argnames="form")
 def slopes_at(
-    form: MotionDynamics, q: Any, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
+    form: MotionDynamics, q: Array, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m r np"]:
     """Return ∂(f, h)/∂q at points."""
 
-    def value_and_slope(q: Any, x: Any, u: Any) -> Any:
+    def value_and_slope(q: Array, x: Array, u: Array) -> Array:
         p = form.motion.coordinates.physical(q, jnp)
         return jnp.concatenate(
             [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
@@ -532,7 +532,7 @@ def _sum_over(
 def _square(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:
-    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+    c, w = numbers.c, numbers.weights
     rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
 
@@ -541,7 +541,7 @@ def _square(
 def _gauss_newton(
     form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
 ) -> Any:
-    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+    c, w = numbers.c, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
         def rest(q: Any) -> Any:
@@ -563,7 +563,7 @@ def _second(
 
     And what the rest is made of.
     """
-    c, w = numbers.theta - numbers.theta_aux, numbers.weights
+    c, w = numbers.c, numbers.weights
 
     def one(x: Any, u: Any) -> Any:
         def half(q: Any, c: Any, w: Any) -> Any:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jnp
+from orthaug._base.jax import AnyArray, Array, jnp
 
 BEYOND = ("auto", "hold", "fade", "free")
 """What `learner.beyond` may be; `auto` is hold for lagged physics, fade for motions, free for
@@ -93,12 +93,12 @@ def pull_of(features: Callable[[Matrix], Matrix], points: Matrix) -> Matrix:
     return pull
 
 
-def clip_to_range(limits: Any, z: Any) -> Any:
+def clip_to_range(limits: AnyArray, z: Array) -> Array:
     """Return the features moved onto the range, z̄ (nz,)."""
     return jnp.clip(z, limits[0], limits[1])
 
 
-def remaining_factor(beyond: str, limits: Any, z: Any) -> Any:
+def remaining_factor(beyond: str, limits: AnyArray, z: Array) -> Array | float:
     """Return the factor a of the correction at features z (nz,): 1 where it is held."""
     if beyond != "fade":
         return 1.0
@@ -107,7 +107,7 @@ def remaining_factor(beyond: str, limits: Any, z: Any) -> Any:
     return jnp.exp(-jnp.sum(apart**2) / FADED**2)
 
 
-def outside(limits: Any, features: Matrix) -> Vector:
+def outside(limits: Matrix, features: Matrix) -> Vector:
     """Return where rows of features (N, nz) leave the range, (N,)."""
     with np.errstate(all="ignore"):
         return ~((features >= limits[0]) & (features <= limits[1])).all(axis=1)

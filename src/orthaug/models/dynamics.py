@@ -14,15 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Experiment, Record
 from orthaug.models.learners import Bound, nothing_learned
 from orthaug.physics.parameters import Coordinates
 
 BATCH = 1024  # rows per compiled call: longer records share the program, of a free run too
-
-AnyArray = Any  # of NumPy or of JAX
 
 
 class Numbers(NamedTuple):
@@ -52,6 +50,11 @@ class Numbers(NamedTuple):
     """
     correction: Any = None
     """(nx, ny), the gain of a predictor (`models.predictor`); None for other dynamics."""
+
+    @property
+    def c(self) -> AnyArray:
+        """θ − θ_aux (nt,): θ as it was fitted beside the learner, before the split."""
+        return self.theta - self.theta_aux
 
     @property
     def free(self) -> Numbers:
@@ -353,7 +356,7 @@ class AutodiffDynamics:
         start = self.start(outputs, [self.first_row])[0]
         return self.run(numbers, start, inputs).states[np.asarray(rows, dtype=int) - self.first_row]
 
-    def first_slopes(self: Dynamics, width: int) -> Any:
+    def first_slopes(self: Dynamics, width: int) -> Array:
         n0 = self.states
         return jnp.broadcast_to(
             jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width)
@@ -404,7 +407,7 @@ def _scan(
     """Return the state behind the rows, and the run along them."""
     numbers = form.prepare(numbers)
 
-    def step(state: Any, row: Any) -> tuple[Any, Run]:
+    def step(state: Array, row: Array) -> tuple[Any, Run]:
         following, parts = form.step(numbers, state, row)
         return following, Run(state, parts)
 
@@ -417,7 +420,7 @@ def last_outputs(
     numbers: Numbers,
     states: Float[Array, "n0 m"],
     inputs: Float[Array, "T nu m"],
-    steps: Any,
+    steps: Array,
     added: Float[Array, "T ny m"] | None = None,
 ) -> Parts:
     """Return the last outputs (ny, m) of `steps` of runs side by side.
@@ -428,7 +431,7 @@ def last_outputs(
     numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row), -1, -1)
 
-    def advance(i: Any, states: Any) -> Any:
+    def advance(i: Array, states: Array) -> Array:
         following = side_by_side(states, inputs[i])[0]
         return following if added is None else following.at[: len(form.outputs)].add(added[i])
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.kalman import (
@@ -89,12 +89,12 @@ class LaggedFilter:
                     )
         return StateEstimate(mean, variance)
 
-    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         parts = self.form.at(numbers, jnp.concatenate([state, inputs])[self.memory.read])
         return jnp.concatenate([parts.total, inputs, state])[self.memory.following], parts
 
     def row(
-        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Array, measured: Array
     ) -> tuple[StateEstimate, FilterRow]:
         n, ny = len(self.memory.lags), len(self.form.outputs)
         value, derivative = slope(_joint_step(self, numbers, inputs), belief.state)
@@ -164,11 +164,11 @@ class MotionFilter:
             self.form.start(without_gaps(experiment.outputs), [row])[0], np.diag(size**2)
         )
 
-    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         return self.form.step(numbers, state, inputs)
 
     def row(
-        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Array, measured: Array
     ) -> tuple[StateEstimate, FilterRow]:
         n = self.form.states
         value, seen = slope(lambda x: self.step(numbers, x, inputs)[1].total, belief.state)
@@ -213,10 +213,10 @@ class MotionFilter:
         )
 
 
-def _joint_step(form: Filter, numbers: Numbers, inputs: Any) -> Callable[[Any], Any]:
+def _joint_step(form: Filter, numbers: Numbers, inputs: AnyArray) -> Callable[[Any], Any]:
     """Return the next state and the outputs as one function of the state."""
 
-    def joint_step(state: Any) -> Any:
+    def joint_step(state: Array) -> Array:
         following, parts = form.step(numbers, state, inputs)
         return jnp.concatenate([following, parts.total])
 

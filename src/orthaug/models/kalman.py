@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp, padded_length
+from orthaug._base.jax import Array, jax, jnp, padded_length
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 
@@ -110,14 +110,14 @@ class Filter(Protocol):
         ...
 
 
-def slope(function: Any, at: Any) -> tuple[Any, Any]:
+def slope(function: Any, at: Array) -> tuple[Any, Any]:
     """Return a function's value (m,) and derivative (m, n); a kink without one counts as flat."""
     value, derivative = function(at), jax.jacfwd(function)(at)
     return value, jnp.where(jnp.isfinite(derivative), derivative, 0.0)
 
 
 def correct(
-    mean: Any, covariance: Any, noise: Any, measured: Any
+    mean: Array, covariance: Array, noise: Any, measured: Array
 ) -> tuple[Any, Any, Any, Any, Any]:
     """Return mean (n + ny,) and covariance of (state, outputs) after a measurement.
 
@@ -142,7 +142,12 @@ def correct(
 
 @partial(jax.jit, static_argnames="form")
 def one_row(
-    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Array,
+    measured: Array,
 ) -> tuple[StateEstimate, FilterRow]:
     """Compute one row of a filter."""
     return form.row(numbers, noise, belief, inputs, measured)
@@ -150,7 +155,12 @@ def one_row(
 
 @partial(jax.jit, static_argnames="form")
 def _all_rows(
-    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Array,
+    measured: Array,
 ) -> tuple[StateEstimate, FilterRow]:
     """Return the estimates before the rows, and those of the rows."""
 
@@ -165,8 +175,13 @@ def _all_rows(
 
 @partial(jax.jit, static_argnames="form")
 def _likelihood(
-    form: Filter, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
-) -> Any:
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    belief: StateEstimate,
+    inputs: Array,
+    measured: Array,
+) -> Array:
     def row(
         carry: tuple[StateEstimate, Any], given: tuple[Any, Any]
     ) -> tuple[tuple[StateEstimate, Any], None]:
@@ -217,7 +232,12 @@ def _pad_rows(inputs: Matrix, measured: Matrix) -> tuple[Matrix, Matrix]:
 
 @partial(jax.jit, static_argnames="form")
 def _predict_outputs(
-    form: Filter, numbers: Numbers, noise: Noise, beliefs: StateEstimate, inputs: Any, horizon: Any
+    form: Filter,
+    numbers: Numbers,
+    noise: Noise,
+    beliefs: StateEstimate,
+    inputs: Array,
+    horizon: Array,
 ) -> tuple[Parts, Any]:
     """Return the outputs after `horizon` steps from each of m estimates, and their covariances S.
 
@@ -225,8 +245,8 @@ def _predict_outputs(
     """
     unknown = jnp.full(len(noise.output), jnp.nan)
 
-    def one(belief: StateEstimate, rows: Any) -> tuple[Parts, Any]:
-        def step(i: Any, belief: StateEstimate) -> StateEstimate:
+    def one(belief: StateEstimate, rows: Array) -> tuple[Parts, Any]:
+        def step(i: Array, belief: StateEstimate) -> StateEstimate:
             return form.row(numbers, noise, belief, rows[i], unknown)[0]
 
         belief = jax.lax.fori_loop(0, horizon - 1, step, belief)
@@ -286,6 +306,6 @@ def without_gaps(outputs: Matrix) -> Matrix:
     return filled
 
 
-def spread_of(covariance: Any) -> Vector:
+def spread_of(covariance: np.ndarray) -> Vector:
     """Return standard deviations, of one covariance or of many."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

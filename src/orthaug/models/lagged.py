@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.jax import AnyArray, Array, ArrayModule, jax, jnp
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, Layout, lag_matrix, largest_lag
@@ -184,16 +184,20 @@ class LaggedDynamics:
         lag, output = np.array(self.fed_back, dtype=int).reshape(-1, 2).T
         return xp.concatenate([past[lag - 1, output], inputs])
 
+    def phi(self, x: AnyArray, xp: ArrayModule = jnp) -> AnyArray:
+        """Return φ(x), (…, ny, nθ), of regressors (…, nx)."""
+        return self.baseline.phi(x, self.layout, self.outputs, xp)
+
     def at(self, numbers: Numbers, x: Float[Array, "nx"]) -> Parts:
         """Return the prediction at one regressor x (nx,), in parts."""
-        phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
+        phi = self.phi(x)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
         physics = known + phi @ numbers.theta
         z = self.features.evaluate(x, self.layout, jnp)
         share: Any = 1.0
         if numbers.limits is not None:
             inside = clip_to_range(numbers.limits, z)
-            phi = self.baseline.phi(x + numbers.pull @ (inside - z), self.layout, self.outputs, jnp)
+            phi = self.phi(x + numbers.pull @ (inside - z))
             share, z = remaining_factor(self.beyond, numbers.limits, z), inside
         raw = _learned_output(self.bound, numbers, (z - numbers.centre) / numbers.halfwidth, phi)
         return Parts(physics, share * (raw - phi @ numbers.theta_aux), raw)
@@ -213,11 +217,11 @@ class LaggedDynamics:
         """Return the numbers unchanged: nothing is common to all steps."""
         return numbers
 
-    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         parts = self.at(numbers, self.regressor(state, inputs))
         return self._push(state, parts.total), parts
 
-    def _push(self, state: Any, y: Any) -> Any:
+    def _push(self, state: Array, y: Array) -> Array:
         """Return the state (n0, …) one step later, when y (ny, …) is the newest output."""
         return jnp.concatenate([y, state[: -len(self.outputs)]]) if self.memory else state
 
@@ -228,7 +232,7 @@ class LaggedDynamics:
         return tuple(jnp.broadcast_to(blocks, (self.memory, ny, n0 + n, width)))
 
     def tangents(
-        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
+        self, numbers: Numbers, state: Array, slopes: Any, inputs: Array
     ) -> tuple[Any, Any, Any, Any]:
         """Propagate `S_k = G_k + Σ_i A_{k,i} S_{k−i}`.
 
@@ -243,12 +247,12 @@ class LaggedDynamics:
         following = (slope, *slopes[:-1]) if self.memory else slopes
         return self._push(state, value), following, value, slope
 
-    def _derivatives(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Any, Any]:
+    def _derivatives(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Any, Any]:
         """Return the value (ny,), ∂g/∂(c, w) (ny, n) and ∂g/∂ŷ (ny, lags) of every fed-back lag."""
         leaves = self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
-        def predict(c: Any, leaves: list[Any], past: Any) -> Any:
+        def predict(c: Array, leaves: list[Any], past: Array) -> Array:
             return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[
                 1
             ].total

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, show
-from orthaug._base.jax import Array, is_traced, jax, jnp
+from orthaug._base.jax import AnyArray, Array, is_traced, jax, jnp
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.models.beyond import BEYOND
 from orthaug.physics.learner_states import MOST_STATES, check_time_constants
@@ -182,7 +182,7 @@ class MLP:
         return z
 
 
-def _uniform(key: Array, reach: Vector, count: int) -> Any:
+def _uniform(key: Array, reach: Vector, count: int) -> AnyArray:
     """Return rows of at least `count` numbers, uniform on [−a, a] for each a of `reach`.
 
     They are drawn in multiples of 1024: one compiled program for layers of all sizes. JAX makes
@@ -311,7 +311,7 @@ class External:
         shape = jax.ShapeDtypeStruct((self.ny,), float)
         return jax.pure_callback(self.values, shape, z, vmap_method="expand_dims")
 
-    def values(self, z: Any) -> np.ndarray:
+    def values(self, z: AnyArray) -> np.ndarray:
         """Return the function's values (…, ny) of features (…, nz).
 
         Raises:
@@ -350,7 +350,7 @@ class Scaling:
         halfwidth = (high - low) / 2
         return cls((low + high) / 2, np.where(halfwidth > 0, halfwidth, 1.0))
 
-    def __call__(self, features: Any) -> Any:
+    def __call__(self, features: Matrix) -> Any:
         return (features - self.centre) / self.halfwidth
 
 
@@ -493,7 +493,7 @@ class Bound:
         Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
         """
 
-        def one_row(leaves: list[Any], z_row: Any, gain_row: Any) -> tuple[Any, list[Any]]:
+        def one_row(leaves: list[Any], z_row: Array, gain_row: Array) -> tuple[Any, list[Any]]:
             value, pullback = jax.vjp(lambda tree: self.from_leaves(tree, z_row), leaves)
             scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
             return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment
 from orthaug.data.sources import Source, as_record
 from orthaug.models.dynamics import Run
@@ -77,7 +77,7 @@ def responses(model: Model, source: Source, *, free: bool) -> Iterator[tuple[Exp
         yield piece, Response((run_piece,), None, model.outputs, source.sampling_time)
 
 
-def _state_after(model: Model, state: Any, outputs: Matrix) -> Any:
+def _state_after(model: Model, state: Vector, outputs: Matrix) -> Vector:
     """Return the state after outputs (m, ny) of a run that began in a state."""
     before = state.reshape(model.form.memory, len(model.outputs))[::-1]
     past = np.concatenate([before, outputs])

@@ -121,6 +121,11 @@ class Model(RecordModel[Form], NotebookView):
         return np.asarray(self.numbers.theta_aux)
 
     @property
+    def units(self) -> dict[str, str]:
+        """Units of the channels by their names."""
+        return {channel.name: channel.unit for channel in (*self.outputs, *self.inputs)}
+
+    @property
     def estimated(self) -> tuple[Sequence[Parameter | PhysicalParameter], Vector]:
         """The parameters and their values, as results list them."""
         coordinates = self.form.coordinates

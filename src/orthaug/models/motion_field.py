@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import AnyArray, Array, jax, jnp, padded_length
 from orthaug.data.expressions import Expression
 from orthaug.models.beyond import beyond_of, clip_to_range, remaining_factor
 from orthaug.models.dynamics import Numbers
@@ -57,11 +57,11 @@ class MotionField:
     def unknowns(self) -> int:
         return len(self.motion.parameters) + self.bound.size
 
-    def now(self, inputs: Any) -> Any:
+    def now(self, inputs: AnyArray) -> AnyArray:
         """Return the record's inputs (…, external) at the sample, of the rows that steps read."""
         return inputs[..., : len(self.motion.external)]
 
-    def split_pace(self, row: Any) -> tuple[Any, Any]:
+    def split_pace(self, row: Array) -> tuple[Any, Any]:
         """Return what a step reads of the inputs, and its length over the sampling time."""
         return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
 
@@ -69,7 +69,7 @@ class MotionField:
         """Return the record's inputs (external,) of all inputs u (nu,) at a point."""
         return u[len(self.motion.held) :]
 
-    def inputs_at(self, numbers: Numbers, x: Any, row: Any) -> Any:
+    def inputs_at(self, numbers: Numbers, x: Array, row: Array) -> Any:
         """Return all inputs u (nu,) of a sample, those of a controller first, at one point."""
         motion, given = self.motion, self.now(row)
         if not motion.held:
@@ -85,7 +85,7 @@ class MotionField:
         rows = [xp.broadcast_to(column, (1, *x.shape[1:])) for column in columns]
         return xp.concatenate([xp.zeros((0, *x.shape[1:])), *rows])
 
-    def learned(self, numbers: Numbers, x: Any, u: Any) -> Any:
+    def learned(self, numbers: Numbers, x: Array, u: Array) -> Array:
         """Return g (learned equations and outputs,) in their units, at one point.
 
         The point may be beyond the range of training.
@@ -102,7 +102,7 @@ class MotionField:
         """Behaviour of the learner's correction beyond its training range."""
         return beyond_of(self.bound.learner, "fade")
 
-    def addition(self, numbers: Numbers, x: Any, u: Any) -> Any:
+    def addition(self, numbers: Numbers, x: Array, u: Array) -> Array:
         """Return the learner's addition to the physics at c, at one point.
 
         Learned equations come first, then outputs.
@@ -117,10 +117,7 @@ class MotionField:
         moved = numbers.pull @ (inside - z)
         share = remaining_factor(self.beyond, numbers.limits, z)
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
-        split, own = (
-            self.motion.coordinates.physical(q, jnp)
-            for q in (numbers.theta, numbers.theta - numbers.theta_aux)
-        )
+        split, own = (self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.c))
         held = (
             self.learned_rows(own, x_in, u_in)
             - self.learned_rows(split, x_in, u_in)
@@ -129,7 +126,7 @@ class MotionField:
         beyond = self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
-    def learned_rows(self, p: Any, x: Any, u: Any) -> Any:
+    def learned_rows(self, p: Array, x: Array, u: Array) -> Array:
         """Return the physics of the learned equations (nl,), then of the learned outputs.
 
         p are the parameters.
@@ -138,7 +135,7 @@ class MotionField:
         rates, observed = self.motion.rates(x, u, p, jnp), self.motion.observed(x, u, p, jnp)
         return jnp.concatenate([rates[states], observed[outputs]])
 
-    def rates(self, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any]:
+    def rates(self, numbers: Numbers, x: Array, u: Array) -> tuple[Any, Any]:
         """Return the equations' right-hand sides of physics and learner, each (nx,)."""
         physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
         learned = jnp.zeros(self.states)
@@ -147,7 +144,7 @@ class MotionField:
             learned = learned.at[np.array(states)].set(self.addition(numbers, x, u)[: len(states)])
         return physics, learned
 
-    def observed(self, numbers: Numbers, x: Any, u: Any) -> Any:
+    def observed(self, numbers: Numbers, x: Array, u: Array) -> Array:
         """Return y (ny,)."""
         y = self.motion.observed(x, u, self.parameters(numbers), jnp)
         states, outputs = self.corrected
@@ -157,9 +154,9 @@ class MotionField:
 
     def parameters(self, numbers: Numbers) -> Any:
         """Return the physical parameters (np,) beside the learner, before any split."""
-        return self.motion.coordinates.physical(numbers.theta - numbers.theta_aux, jnp)
+        return self.motion.coordinates.physical(numbers.c, jnp)
 
-    def linear_part(self, numbers: Numbers) -> Any:
+    def linear_part(self, numbers: Numbers) -> Array:
         """Return ∂f/∂x of the physics at the origin; 0 where it has none."""
         p, rest = self.parameters(numbers), jnp.zeros(len(self.motion.inputs))
         slope = jax.jacfwd(lambda x: self.motion.rates(x, rest, p, jnp))(jnp.zeros(self.states))
@@ -224,12 +221,12 @@ def _rate(unit: str) -> str:
 def _parts(
     form: MotionField, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl"], Float[Array, "m nl"]]:
-    def physics(q: Any, x: Any, u: Any) -> Any:
+    def physics(q: Any, x: Array, u: Array) -> Array:
         return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
-    def at(x: Any, u: Any) -> tuple[Any, Any]:
+    def at(x: Array, u: Array) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)
-        whole = physics(numbers.theta - numbers.theta_aux, x, u)
+        whole = physics(numbers.c, x, u)
         return split, whole - split + (form.addition(numbers, x, u) if form.learns else 0.0)
 
     return jax.vmap(at)(x, u)

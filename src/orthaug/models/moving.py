@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import (
@@ -48,7 +48,7 @@ class Slopes(NamedTuple):
     to_w: Any
 
 
-def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> Slopes:
+def sample_slopes(form: MotionField, numbers: Numbers, state: Array, row: Array) -> Slopes:
     """Return x one sample later with its slopes, at one state (nx,) and input row, under `rk4`."""
     row, pace = form.split_pace(row)
     at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
@@ -79,15 +79,15 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Any, row: Any) -> 
 
 
 @partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
-def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def field_slopes(form: MotionField, numbers: Numbers, x: Array, u: Array) -> Slopes:
     """Return F and its slopes at one point.
 
     ∂/∂w is that of the learned equations only, (nl, nw).
     """
-    c = numbers.theta - numbers.theta_aux
+    c = numbers.c
     coordinates = form.motion.coordinates
 
-    def physics(x: Any, c: Any) -> Any:
+    def physics(x: Array, c: Array) -> Array:
         return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
     value, to_x, to_c = _differentiate(physics, x, c, form.motion)
@@ -102,11 +102,11 @@ def field_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
     return Slopes(value, to_x.at[rows].add(learner.to_x[:count]), to_c, learner.to_w[:count])
 
 
-def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def learner_slopes(form: MotionField, numbers: Numbers, x: Array, u: Array) -> Slopes:
     """Return g and its slopes at one point: learned equations first, then learned outputs."""
     bound = form.bound
 
-    def features(x: Any) -> Any:
+    def features(x: Array) -> Any:
         return (form.seen(x, u) - numbers.centre) / numbers.halfwidth
 
     z, to_z = features(x), _finite(jax.jacfwd(features)(x))
@@ -122,11 +122,11 @@ def learner_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slope
     return Slopes(gain * value, _finite(to_x), jnp.zeros((bound.ny, 0)), _finite(to_w))
 
 
-def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes:
+def output_slopes(form: MotionField, numbers: Numbers, x: Array, u: Any) -> Slopes:
     """Return y and its slopes at one point."""
-    c = numbers.theta - numbers.theta_aux
+    c = numbers.c
 
-    def physics(x: Any, c: Any) -> Any:
+    def physics(x: Array, c: Array) -> Array:
         return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
 
     value, to_x, to_c = _differentiate(physics, x, c, form.motion)
@@ -140,7 +140,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Any, u: Any) -> Slopes
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
 
 
-def _differentiate(function: Any, x: Any, c: Any, motion: Motion) -> tuple[Any, Any, Any]:
+def _differentiate(function: Any, x: Array, c: Any, motion: Motion) -> tuple[Any, Any, Any]:
     """Return the value and its slopes by x and c.
 
     Few entries are differentiated one at a time, without what an entry does not touch. A source
@@ -158,8 +158,8 @@ def _differentiate(function: Any, x: Any, c: Any, motion: Motion) -> tuple[Any, 
     if len(entries) > _FEW:
         return function(x, c), *jax.jacfwd(function, (0, 1))(x, c)
 
-    def along(i: int) -> Any:
-        def of(entry: Any) -> Any:
+    def along(i: int) -> Array:
+        def of(entry: Array) -> Any:
             moved = [*entries[:i], entry, *entries[i + 1 :]]
             return function(jnp.stack(moved[:n0]), jnp.stack(moved[n0:]))
 
@@ -169,7 +169,7 @@ def _differentiate(function: Any, x: Any, c: Any, motion: Motion) -> tuple[Any, 
     return function(x, c), jnp.stack(slopes[:n0], axis=-1), jnp.stack(slopes[n0:], axis=-1)
 
 
-def _finite(slope: Any) -> Any:
+def _finite(slope: Array) -> Array:
     """Return slopes with 0 for a derivative that does not exist, as of sqrt(max(x, 0)) at 0."""
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
@@ -282,10 +282,10 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         )
         return {name: float(value) for name, value in named}
 
-    def step(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         return _step(self, numbers, state, inputs)
 
-    def _step_once(self, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+    def _step_once(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Parts]:
         motion, now = self.motion, self.inputs_at(numbers, state, inputs)
         y = self.observed(numbers, state, now)
         following = self._to_next_sample(numbers, state, now, inputs)
@@ -294,7 +294,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             following = motion.after_sample(following, y, state, now, p, jnp)
         return following, Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
 
-    def _to_next_sample(self, numbers: Numbers, state: Any, now: Any, inputs: Any) -> Any:
+    def _to_next_sample(self, numbers: Numbers, state: Any, now: Any, inputs: Array) -> Any:
         """Return the states one sample later, with what a controller sets held until then."""
         if self.motion.scheme.discrete:
             return sum(self.rates(numbers, state, now))
@@ -347,7 +347,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     ) -> tuple[Any, Any, Any, Any]:
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
-    def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
+    def local(self, numbers: Numbers, states: Array, inputs: Array) -> Local:
         """Return the slopes of a few Runge-Kutta substeps by the adjoint of their stages.
 
         Other schemes are differentiated automatically.
@@ -387,7 +387,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
 
 @partial(jax.jit, static_argnames="form")
-def _step(form: MotionDynamics, numbers: Numbers, state: Any, inputs: Any) -> tuple[Any, Parts]:
+def _step(form: MotionDynamics, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Parts]:
     """Return a step.
 
     It is traced once, whatever programs contain it; so is the field in it.

@@ -159,7 +159,7 @@ def trajectory(
 ) -> Trajectory:
     """Return parts from a row on as a trajectory of the whole experiment."""
 
-    def pad_rows(values: Any) -> Matrix:
+    def pad_rows(values: Matrix) -> Matrix:
         padded = np.full((len(experiment), values.shape[1]), np.nan)
         padded[first:] = values
         return padded

@@ -39,6 +39,20 @@ def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path)
     path.write_text(json.dumps(packed[0], indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def has_files(folder: Path, *names: str) -> bool:
+    """Return whether a folder has files of these names.
+
+    Raises:
+        InputError: a folder that cannot be read.
+    """
+    try:
+        return all((folder / name).is_file() for name in names)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
+    except ValueError:  # a NUL byte in the name
+        return False
+
+
 def read_packed(
     path: Path, arrays: Path, number: int, what: str, again: str
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

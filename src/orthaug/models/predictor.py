@@ -49,7 +49,7 @@ class PredictorDynamics(MotionDynamics):
         """Return K."""
         if not self._gains:
             return jnp.asarray(numbers.correction)
-        c = numbers.theta - numbers.theta_aux
+        c = numbers.c
         own = len(self.motion.parameters) - self._gains
         return jnp.reshape(c[own:], (self.states, len(self.outputs)))
 

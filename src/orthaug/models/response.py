@@ -131,11 +131,6 @@ class Trajectory:
         assert self.measured is not None, "of a record with measured outputs"
         return (self.measured - self.model)[self.start :]
 
-    @property
-    def baseline_before(self) -> Matrix:
-        """φ(θ − θ_aux), the baseline that belongs to `learner_before`."""
-        return self.model - self.learner_before
-
 
 @dataclass(frozen=True, eq=False)
 class Response:

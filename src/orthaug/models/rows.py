@@ -53,7 +53,7 @@ class Chunk(NamedTuple):
         return rows if self.noise is None else self.noise.apply(rows)
 
     def derivatives(
-        self, bound: Bound, w: Any
+        self, bound: Bound, w: Array
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
         """Return F and J, the learner's values and their derivatives by the weights."""
         values, jacobian = bound.jacobian(w, self.z, self.gain)
@@ -329,8 +329,8 @@ def learner_rows(
     form: LaggedDynamics,
     numbers: Numbers,
     x: Matrix,
-    q: Any,
-    weight: Any,
+    q: np.ndarray,
+    weight: np.ndarray,
     noise: RowFilter | None = None,
 ) -> Any:
     """Return regressors x (N, nx) as rows of the engine.
@@ -353,7 +353,7 @@ class Overlaps:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Any) -> Overlap:
+    def __call__(self, chunk: Chunk, w: Array) -> Overlap:
         values, jacobian = chunk.derivatives(self.bound, w)
         return Overlap(
             jnp.einsum("otm,wom->tw", chunk.q, jacobian), jnp.einsum("otm,om->t", chunk.q, values)
@@ -372,7 +372,7 @@ class MixedGram:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Any, mix: Any, overlaps: tuple[Any, ...] = ()) -> Any:
+    def __call__(self, chunk: Chunk, w: Array, mix: Array, overlaps: tuple[Any, ...] = ()) -> Array:
         columns = jnp.concatenate(_columns(self.bound, chunk, w, overlaps))
         return gram(jnp.einsum("oi,nim->nom", mix, columns).reshape(len(columns), -1))
 
@@ -387,7 +387,7 @@ class _LeftOver:
         return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-def _columns(bound: Bound, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
+def _columns(bound: Bound, chunk: Chunk, w: Array, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
     """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
     jacobian = chunk.derivatives(bound, w)[1]
@@ -416,13 +416,13 @@ def row_values(
     return jax.lax.map(one_chunk, z)
 
 
-def _values(bound: Bound, chunk: Chunk, w: Any, tilt: Any) -> Float[Array, "ny m"]:
+def _values(bound: Bound, chunk: Chunk, w: Array, tilt: Array | None) -> Float[Array, "ny m"]:
     """Return F of one chunk.
 
     For an ensemble it is the median of the members, each with the physics that it adds.
     """
 
-    def member_values(w: Any) -> Any:
+    def member_values(w: Array) -> Array:
         values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
         return chunk.learned(values)
 
@@ -437,7 +437,7 @@ class LearnerSums:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Any, tilt: Any, shift: Any) -> tuple[Any, Any]:
+    def __call__(self, chunk: Chunk, w: Array, tilt: Array | None, shift: Array) -> tuple[Any, Any]:
         values = _values(self.bound, chunk, w, tilt)
         rest = values - jnp.einsum("otm,t->om", chunk.q, shift)
         return jnp.einsum("otm,om->t", chunk.q, rest), jnp.sum(values**2)
@@ -449,7 +449,7 @@ class ResidualGram:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Any, tilt: Any, physics: Any) -> Any:
+    def __call__(self, chunk: Chunk, w: Array, tilt: Array | None, physics: Array) -> Array:
         residual = (
             chunk.e
             - _values(self.bound, chunk, w, tilt)

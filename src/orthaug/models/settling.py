@@ -46,7 +46,7 @@ class Windows(NamedTuple):
         length = padded_steps(steps) if count > _LANES else max(padded_steps(steps), _USUAL)
         more = length - steps, -count % _LANES
 
-        def repeat_last(part: Any) -> Any:
+        def repeat_last(part: np.ndarray) -> np.ndarray:
             return np.pad(
                 part, ((0, more[0]), *((0, 0),) * (part.ndim - 2), (0, more[1])), mode="edge"
             )
@@ -144,7 +144,7 @@ def _gram(
     numbers: Numbers,
     states: Float[Array, "n0 m"],
     windows: Windows,
-    steps: Any,
+    steps: Array,
     weight: Float[Array, "ny ny"],
 ) -> tuple[Float[Array, "n0 n0+1 m"], Float[Array, "m"]]:
     """Return the Gram matrix of the sensitivities to the start and of the error.
@@ -157,11 +157,11 @@ def _gram(
     first = jnp.broadcast_to(jnp.eye(n0)[..., None], (n0, n0, m))
     sums = (first, jnp.zeros((n0, n0 + 1, m)), jnp.zeros(m))
 
-    def step_and_output(state: Any, row: Any) -> Any:
+    def step_and_output(state: Array, row: Array) -> Array:
         following, parts = form.step(numbers, state, row)
         return jnp.concatenate([following, parts.total])
 
-    def step_with_slopes(state: Any, row: Any) -> tuple[Any, Any]:
+    def step_with_slopes(state: Array, row: Array) -> tuple[Any, Any]:
         """Return a step and its slopes (n0 + ny, n0)."""
         along = jax.vmap(
             lambda moved: jax.jvp(lambda x: step_and_output(x, row), (state,), (moved,)),
@@ -169,7 +169,7 @@ def _gram(
         )
         return along(directions)
 
-    def add(i: Any, sums: tuple[Any, ...], value: Any, slope: Any) -> tuple[Any, ...]:
+    def add(i: Any, sums: tuple[Any, ...], value: Array, slope: Any) -> tuple[Any, ...]:
         """Return slopes and sums after step i, from its values and slopes."""
         slopes, gram, square = sums
         _, target, there = (part[i] for part in windows)
@@ -191,7 +191,7 @@ def _gram(
             0, steps, lambda i, sums: add(i, sums, *(part[i] for part in every)), sums
         )[1:]
 
-    def advance(i: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def advance(i: Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         state, *sums = carry
         value, slope = jax.vmap(step_with_slopes, -1, -1)(state, windows.inputs[i])
         return value[:n0], *add(i, tuple(sums), value, slope)

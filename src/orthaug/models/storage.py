@@ -29,7 +29,7 @@ from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound, Learner, nothing_learned
 from orthaug.models.model import Model, TrainedSegments
 from orthaug.models.moving import MotionDynamics
-from orthaug.models.packed_files import pack, read_packed, write_packed
+from orthaug.models.packed_files import has_files, pack, read_packed, write_packed
 from orthaug.models.starts import EstimatedStates
 from orthaug.models.statistics import Statistics
 from orthaug.physics import source_kinds
@@ -121,15 +121,9 @@ def load(
     """
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
     folder = Path(folder)
-    try:
-        if not (folder / _DECLARATION).exists() and (folder / "model" / _DECLARATION).exists():
-            folder = folder / "model"
-        there = (folder / _DECLARATION).is_file() and (folder / _ARRAYS).is_file()
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}).") from None
-    except ValueError:  # a NUL byte in the name
-        there = False
-    if not there:
+    if not has_files(folder, _DECLARATION) and has_files(folder / "model", _DECLARATION):
+        folder = folder / "model"
+    if not has_files(folder, _DECLARATION, _ARRAYS):
         raise MissingFileError(
             f"{folder}: no saved model there; expected {_DECLARATION} and {_ARRAYS}."
         )

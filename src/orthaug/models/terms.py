@@ -13,6 +13,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array, jnp
+from orthaug._base.lines import first_words
 from orthaug._base.registry import OneOf, check_fields
 from orthaug.data.regressors import Lags
 from orthaug.data.terms import TermLibrary
@@ -85,9 +86,7 @@ class Terms:
         TermLibrary.of((), 0, self.functions)  # refuses unknown functions before there are signals
 
     def __str__(self) -> str:
-        named = ", ".join(self.terms[:_NAMED]) + (
-            f" and {len(self.terms) - _NAMED} more" * (len(self.terms) > _NAMED)
-        )
+        named = first_words(self.terms, _NAMED)
         return f"terms {named}" if not self.degree else f"all terms to the degree {self.degree}"
 
     linear = True

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import check_label, check_type, check_unique, is_number
+from orthaug._base.checks import Matrix, check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import (
@@ -318,7 +318,9 @@ class Baseline(NotebookView):
             return xp.zeros((*x.shape[:-1], len(outputs)))
         return self._matrix(list(fixed), x, layout, outputs, xp) @ xp.asarray(list(fixed.values()))
 
-    def on(self, x: Any, layout: Layout, outputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    def on(
+        self, x: Matrix, layout: Layout, outputs: Sequence[str]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return `phi` and `known` by NumPy; not finite where an expression has no value."""
         with np.errstate(all="ignore"):
             return np.asarray(self.phi(x, layout, outputs, np)), np.asarray(

@@ -12,7 +12,7 @@ not know the controller: p of a controller moves no equation at a point. No JAX.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, TypeVar
@@ -57,9 +57,8 @@ class ClosedLoop(Motion):
     @property
     def plant(self) -> Motion:
         """The motion without the controller, its inputs as they are set from outside."""
-        own = {field.name: getattr(self, field.name) for field in fields(Motion)}
         return Motion(
-            **own
+            **self.declaration
             | {
                 "states": tuple(s for s in self.states if s.name not in self.discrete_states),
                 "outputs": tuple(o for o in self.outputs if o.name not in self.held),
@@ -207,7 +206,7 @@ def close_loop(
             del measured[name]
     order = [*(n for n in outputs if n in measured), *(n for n in measured if n not in outputs)]
     _check_names(motion, controller, inputs)
-    own = {field.name: getattr(motion, field.name) for field in fields(Motion)}
+    own = motion.declaration
     own |= {
         "states": (
             *motion.without_memory.states,

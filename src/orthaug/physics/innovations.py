@@ -11,7 +11,7 @@ estimated with the parameters. It is in no equation at a point. No JAX.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -42,7 +42,7 @@ class InnovationsForm(Motion):
 
     @cached_property
     def _plant(self) -> Motion:
-        return Motion(**_given(self, self.parameters[: self.own]))
+        return Motion(**{**self.declaration, "parameters": self.parameters[: self.own]})
 
     @property
     def plant(self) -> Motion:
@@ -57,12 +57,6 @@ class InnovationsForm(Motion):
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
         return self._plant.observed(x, u, p[: self.own], xp)
-
-
-def _given(motion: Motion, parameters: tuple[PhysicalParameter, ...]) -> dict[str, Any]:
-    """Return the fields of a motion, with other parameters."""
-    given = {field.name: getattr(motion, field.name) for field in fields(Motion)}
-    return given | {"parameters": parameters}
 
 
 def innovations_form(motion: Motion) -> InnovationsForm:
@@ -86,7 +80,7 @@ def innovations_form(motion: Motion) -> InnovationsForm:
         for state in motion.states
         for output in motion.outputs
     )
-    return InnovationsForm(**_given(motion, (*motion.parameters, *gains)))
+    return InnovationsForm(**{**motion.declaration, "parameters": (*motion.parameters, *gains)})
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -146,6 +146,16 @@ class Motion(NotebookView):
         """The integrator."""
         return INTEGRATORS[self.integrator]()
 
+    @property
+    def equation_key(self) -> str:
+        """The key of a state's equation in a declaration."""
+        return "next" if self.scheme.discrete else "derivative"
+
+    @property
+    def declaration(self) -> dict[str, Any]:
+        """The fields of a motion by name, without those of its kind."""
+        return {field.name: getattr(self, field.name) for field in fields(Motion)}
+
     @classmethod
     def from_equations(
         cls,
@@ -202,8 +212,9 @@ class Motion(NotebookView):
         motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
         for state in plain.states:
             if state.derivative is None:
-                what = "next" if plain.scheme.discrete else "derivative"
-                raise InputError(f"the state '{state.name}' has no `{what}`; give its equation.")
+                raise InputError(
+                    f"the state '{state.name}' has no `{plain.equation_key}`; give its equation."
+                )
             parse_named(state.derivative, everything, f"the equation of '{state.name}'")
         for output in plain.outputs:
             if output.expression is None:

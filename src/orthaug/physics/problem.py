@@ -224,6 +224,10 @@ class Problem(PosedProblem):
         """Number of rows that the criterion counts."""
         return self.count if self.noise is None else self.noise.counted
 
+    def phi(self, x: Matrix) -> Float[np.ndarray, "M ny nt"]:
+        """Return φ(x) of regressors (M, nx)."""
+        return np.asarray(self.baseline.phi(x, self.layout, self.outputs, np))
+
     def filtered(self, noise: RowFilter | None) -> Problem:
         """Return the problem under a noise model; None for white errors."""
         phi = self.baseline.on(self.rows.x, self.layout, self.outputs)[0]

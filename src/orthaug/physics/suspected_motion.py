@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -71,7 +71,7 @@ class SuspectedMotion(Motion):
     @classmethod
     def of(cls, physics: Motion, added: Sequence[SuspectedTerm]) -> SuspectedMotion:
         """Return the motion with terms that read the same names as its equations."""
-        own = {field.name: getattr(physics, field.name) for field in fields(Motion)}
+        own = physics.declaration
         own["parameters"] = (
             *physics.parameters,
             *(PhysicalParameter(term.name, 0.0) for term in added),

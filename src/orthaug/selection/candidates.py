@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import first_words
 from orthaug.data.terms import TermLibrary, products_of
 from orthaug.fitting.criteria import Prediction
 from orthaug.physics.problem import Problem
@@ -149,16 +150,12 @@ def _notes(library: TermLibrary, finite: np.ndarray, own: np.ndarray) -> list[Wa
     texts, notes = library.texts, []
     infinite = [texts[i] for i in np.flatnonzero(~finite)]
     if infinite:
-        text = f"terms that are not finite on these data were left out: {_name_texts(infinite)}."
+        named = first_words(infinite, _NAMED)
+        text = f"terms that are not finite on these data were left out: {named}."
         notes.append(Warning("terms_not_finite", text))
     known = [texts[i] for i in np.flatnonzero(finite & ~own)]
     if known:
-        text = f"terms that the physics expresses already were left out: {_name_texts(known)}."
+        named = first_words(known, _NAMED)
+        text = f"terms that the physics expresses already were left out: {named}."
         notes.append(Warning("terms_are_physics", text))
     return notes
-
-
-def _name_texts(texts: list[str]) -> str:
-    return ", ".join(texts[:_NAMED]) + (
-        f" and {len(texts) - _NAMED} more" if len(texts) > _NAMED else ""
-    )

@@ -190,11 +190,10 @@ def added_to_motion(
         substeps=motion.substeps,
         hold=motion.hold,
     )
-    own = "next" if motion.scheme.discrete else "derivative"
     states = {state.name for state in motion.states}
     places = dict.fromkeys(one.added_to for one in added)
     equations = tuple(
-        (f"motion.states.{name}", own, texts[name])
+        (f"motion.states.{name}", motion.equation_key, texts[name])
         if name in states
         else (f"motion.outputs.{name}", "expression", texts[name])
         for name in places
@@ -542,7 +541,7 @@ def _base_name(candidate: Candidate) -> str:
 
 
 def _physics(
-    linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Any
+    linearization: LearnedLinearization, terms: Sequence[ExplainingTerm], moved: Vector
 ) -> tuple[Baseline | Motion | None, str | None]:
     """Return the physics with the terms added, and the lines that say so in a spec."""
     added = [_new_term(linearization, term) for term in terms]
@@ -559,7 +558,7 @@ def _with_terms(
 
 @_with_terms.register(Motion)
 def _motion_with_terms(
-    physics: Motion, linearization: LearnedLinearization, moved: Any, added: Sequence[NewTerm]
+    physics: Motion, linearization: LearnedLinearization, moved: Vector, added: Sequence[NewTerm]
 ) -> tuple[Motion | None, str | None]:
     changed = added_to_motion(physics, moved, added, linearization.units)
     return (None, None) if changed is None else (changed.motion, changed.lines())
@@ -567,7 +566,7 @@ def _motion_with_terms(
 
 @_with_terms.register(Baseline)
 def _baseline_with_terms(
-    physics: Baseline, linearization: LearnedLinearization, moved: Any, added: Sequence[NewTerm]
+    physics: Baseline, linearization: LearnedLinearization, moved: Vector, added: Sequence[NewTerm]
 ) -> tuple[Baseline | None, str | None]:
     several = len(linearization.places) > 1
     baseline = added_to_baseline(physics, moved, added, several)

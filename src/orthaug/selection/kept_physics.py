@@ -15,7 +15,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug.selection.forward import Equations, spanned_columns
-from orthaug.selection.term_runs import Able, Point, TermRuns
+from orthaug.selection.term_runs import Point, TermRuns
 
 MOVED, SPANNED = "physics_moved", "terms_within_span"
 _SURE = 1.96  # standard errors
@@ -107,17 +107,11 @@ class PhysicsComparison:
         return notes
 
 
-def kept_physics(
-    runs: TermRuns, alone: Point, chosen: Point, able: Able = None
-) -> PhysicsComparison:
-    """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion.
-
-    Args:
-        able: the terms that the choice was made among.
-    """
+def kept_physics(runs: TermRuns, alone: Point, chosen: Point) -> PhysicsComparison:
+    """Compare θ of physics alone with θ beside the chosen terms, both trained on the criterion."""
     physics, nt, texts = runs.problem.baseline, len(alone.c), runs.library.texts
     columns = [*range(nt), *(nt + i for i in chosen.chosen)]
-    every = runs.equations(chosen, able)
+    every = runs.equations(chosen, None)
     before_std, _ = standard_errors(runs, alone, runs.equations(alone, ()).of(range(nt)))
     after_std, _ = standard_errors(runs, chosen, every.of(columns))
     left, condition = _what_is_left(every.of(columns))

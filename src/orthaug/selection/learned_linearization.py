@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
@@ -130,7 +130,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
     x = x[:: max(1, -(-len(x) * len(form.outputs) // MOST_CELLS))]
     with np.errstate(all="ignore"):
         target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
-        phi = np.asarray(form.baseline.phi(x, form.layout, form.outputs, np))
+        phi = np.asarray(form.phi(x, np))
         z = np.asarray(form.features.evaluate(x, form.layout, np))
     finite = (
         np.isfinite(target).all(axis=1)
@@ -152,8 +152,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
         places=tuple((channel.name, channel.unit) for channel in model.outputs),
         signals=(*own, *_rates_of_change(form.outputs, own)),
         seen=len(own),
-        units={channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-        | {SAMPLING_TIME: "s"},
+        units=model.units | {SAMPLING_TIME: "s"},
         parse=lambda text: parse(text, constants),
         evaluate=lambda expression: expression.evaluate(columns, np),
         moved=lambda along: c + along,
@@ -179,8 +178,7 @@ def _of_motion(model: Model[MotionDynamics], record: Record) -> LearnedLineariza
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = tuple(dict.fromkeys(str(entry) for entry in form.features))
     z = np.asarray(form.seen(x.T, u.T, np)).T
-    units = {channel.name: channel.unit for channel in (*model.outputs, *model.inputs)}
-    units |= {parameter.name: parameter.unit for parameter in motion.parameters}
+    units = model.units | {parameter.name: parameter.unit for parameter in motion.parameters}
     return LearnedLinearization(
         target=target,
         physics_moves=np.concatenate([linear.forward(slopes), linear.starts()], axis=1),
@@ -228,7 +226,7 @@ class MotionResponse:
         x: Matrix,
         u: Matrix,
         rows: Matrix,
-        begins: Any,
+        begins: np.ndarray,
         weight: Matrix,
     ) -> MotionResponse:
         """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
@@ -284,7 +282,7 @@ class MotionResponse:
 
 @partial(jax.jit, static_argnames="form")
 def _derivatives(
-    form: MotionDynamics, numbers: Numbers, x: Any, u: Any, rows: Any
+    form: MotionDynamics, numbers: Numbers, x: Array, u: Array, rows: Array
 ) -> tuple[Any, Any]:
     """Return ∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepare(numbers)
@@ -391,14 +389,14 @@ def _rates_of_change(outputs: Sequence[str], seen: Sequence[str]) -> list[str]:
     return found
 
 
-def _share_beyond(model: Any, z: Matrix) -> float:
+def _share_beyond(model: Model, z: Matrix) -> float:
     """Return the share of the points with a feature outside its training range."""
     if not model.form.bound.differentiable or not len(z):
         return 0.0
     return float(np.mean(model.beyond(z)))
 
 
-def _tangent(model: Any, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
+def _tangent(model: Model, z: Matrix, weight: Matrix, response: Response | None) -> Tangent | None:
     """Return the learner's derivatives at its features z (M, nz)."""
     bound, numbers, statistics = model.form.bound, model.numbers, model.statistics
     if not bound.differentiable or numbers.tilt is not None or not 0 < bound.size <= MOST_WEIGHTS:

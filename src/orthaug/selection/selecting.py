@@ -402,7 +402,7 @@ class _Listener:
         self.progress, self.stopped = progress, False
 
     def of(self, stage: str) -> Callable[[Any], None]:
-        def report(rung: Any) -> None:
+        def report(rung: PathModel) -> None:
             try:
                 if self.progress is not None:
                     self.progress(stage, rung)

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp
+from orthaug._base.checks import Matrix, Vector, positive
+from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.expressions import Lag, parse
-from orthaug.data.record import Record
+from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, in_order
 from orthaug.data.terms import CONSTANT, TermLibrary, products_of
 from orthaug.fitting.criteria import Criterion, Simulation
@@ -65,7 +65,9 @@ class Menu(LaggedDynamics):
     def unknowns(self) -> int:
         return len(self.baseline.names) + self.width
 
-    def numbers(self, theta: Any, products: Any, weights: Any, sizes: Any) -> Numbers:
+    def numbers(
+        self, theta: Vector, products: np.ndarray, weights: Vector, sizes: Vector
+    ) -> Numbers:
         """Return the model's numbers for coefficients (width,) of terms of scaled factors.
 
         The factors are divided by their `sizes`.
@@ -75,15 +77,15 @@ class Menu(LaggedDynamics):
             np.asarray(theta), np.zeros(len(theta)), pair, np.zeros(len(sizes)), sizes, np.ones(1)
         )
 
-    def terms(self, numbers: Numbers, x: Any) -> Any:
+    def terms(self, numbers: Numbers, x: Array) -> Any:
         """Return t (width,) at one regressor x (nx,)."""
         factors = self.features.evaluate(x, self.layout, jnp) / numbers.halfwidth
         return products_of(factors, numbers.weights[0], jnp)
 
-    def at(self, numbers: Numbers, x: Any) -> Parts:
+    def at(self, numbers: Numbers, x: Array) -> Parts:
         return self._with_slopes(numbers, x)[0]
 
-    def _with_slopes(self, numbers: Numbers, x: Any) -> tuple[Parts, Any]:
+    def _with_slopes(self, numbers: Numbers, x: Array) -> tuple[Parts, Any]:
         """Return the prediction at x in parts, and ∂ŷ/∂(c, w) (1, n): it is linear in both."""
         phi = self.baseline.phi(x, self.layout, self.outputs, jnp)
         known = self.baseline.known(x, self.layout, self.outputs, jnp)
@@ -176,7 +178,7 @@ class TermRuns:
                 largest = np.abs(
                     np.concatenate([runs.factors(e) for e in problem.record.experiments], axis=1)
                 ).max(axis=1)
-            runs = replace(runs, sizes=np.where(np.isfinite(largest) & (largest > 0), largest, 1.0))
+            runs = replace(runs, sizes=positive(largest))
         if criterion.one_step:
             return runs
         trial = criterion.free_run
@@ -203,7 +205,7 @@ class TermRuns:
         narrow = _NARROW if self.problem.count >= _MANY_ROWS else ()
         return next((n for n in narrow if count <= n), _PLACES * max(1, -(-count // _PLACES)))
 
-    def factors(self, experiment: Any) -> Float[np.ndarray, "nf T"]:
+    def factors(self, experiment: Experiment) -> Float[np.ndarray, "nf T"]:
         """Return the factors along an experiment, over their sizes."""
         x = self.menu.regressors(experiment, self.problem.record)
         with np.errstate(all="ignore"):
@@ -212,7 +214,9 @@ class TermRuns:
                 / self.sizes[:, None]
             )
 
-    def rows(self, experiment: Any) -> tuple[Float[np.ndarray, "T nx"], Float[np.ndarray, "T 1"]]:
+    def rows(
+        self, experiment: Experiment
+    ) -> tuple[Float[np.ndarray, "T nx"], Float[np.ndarray, "T 1"]]:
         """Return regressors and outputs along an experiment."""
         return self.menu.regressors(experiment, self.problem.record), experiment.outputs[
             self.menu.first_row :

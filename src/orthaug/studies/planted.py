@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix, Vector, free_name
 from orthaug.analysis.catalogue import Catalogue
 from orthaug.analysis.imitation import Alternative, imitation, imitation_before
 from orthaug.analysis.suspects import MotionSuspect, Suspect, median_size
@@ -266,15 +266,15 @@ class LaggedSystem:
         baseline, suspect = problem.baseline, planted.suspect
         outputs, inputs = problem.outputs, tuple(c.name for c in problem.record.inputs)
         taken = {*outputs, *inputs, *baseline.names, *(name for name, _ in baseline.constants)}
-        names = [_free(f"noise_{i + 1}", taken) for i in range(len(outputs))]
-        signal = [] if suspect.memory is None else [_free("memory", taken)]
+        names = [free_name(f"noise_{i + 1}", taken) for i in range(len(outputs))]
+        signal = [] if suspect.memory is None else [free_name("memory", taken)]
         text = f"{signal[0]}[k]" if signal else suspect.expression
         place = outputs[suspect.column_of(outputs)]
         terms = [
             *baseline.terms,
-            Term(_free("planted", taken), text, output=place),
+            Term(free_name("planted", taken), text, output=place),
             *(
-                Term(_free(f"entering_{i + 1}", taken), f"{name}[k]", output=output)
+                Term(free_name(f"entering_{i + 1}", taken), f"{name}[k]", output=output)
                 for i, (name, output) in enumerate(zip(names, outputs, strict=True))
             ),
         ]
@@ -293,14 +293,6 @@ class LaggedSystem:
 def _time_constant(rows: int, step: float) -> float:
     """Return the time constant [s] of a lag that a stretch of so many rows shows."""
     return float(f"{step * float(np.clip(_LAG_ROWS * rows, 1.0, _MOST_SAMPLES)):.3g}")
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken, and take it."""
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,13 +128,13 @@ class AdamLBFGS:
         return GradientRun(v, w, done, ending, training_clock() - began)
 
 
-def _goes_on(state: _GradientState) -> Any:
+def _goes_on(state: _GradientState) -> Array:
     """Return whether another step makes sense: the loss is finite and still falls."""
     return jnp.isfinite(state.loss) & (state.small < 5)
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Any:
+def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Array:
     return criterion(unknowns, chunks, physics)
 
 
@@ -144,8 +144,8 @@ def _adam(
     state: _GradientState,
     chunks: Chunk,
     physics: Physics,
-    rate: Any,
-    stop: Any,
+    rate: Array,
+    stop: Array,
 ) -> _GradientState:
     import optax
 
@@ -166,14 +166,14 @@ def _lbfgs(
     state: _GradientState,
     chunks: Chunk,
     physics: Physics,
-    rate: Any,
-    stop: Any,
+    rate: Array,
+    stop: Array,
 ) -> _GradientState:
     import optax
 
     optimizer = optax.lbfgs(memory_size=_MEMORY)
 
-    def value(unknowns: Any) -> Any:
+    def value(unknowns: Any) -> Array:
         return criterion(unknowns, chunks, physics)
 
     value_and_grad = optax.value_and_grad_from_state(value)

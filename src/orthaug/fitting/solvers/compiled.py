@@ -86,7 +86,7 @@ class Settings(minimize.Settings):
     samples: int
     groups: Int[np.ndarray, "nw"] | None = None
 
-    def prepare(self, w: Any) -> tuple[Options, Any, State | None]:
+    def prepare(self, w: Array) -> tuple[Options, Any, State | None]:
         """Return the numbers of the compiled program, the initial ridge, and the first state."""
         groups = self.groups
         if (
@@ -184,7 +184,7 @@ def minimize_by_engine(
 
 
 @partial(jax.jit, static_argnames="damping")
-def _first_state(w: Any, normal: Normal, ridge: Any, damping: Damping) -> State:
+def _first_state(w: Array, normal: Normal, ridge: Array, damping: Damping) -> State:
     finite = jnp.isfinite(normal.loss) & jnp.all(jnp.isfinite(normal.hessian))
     start = jnp.where(is_spanned(normal), int(Ending.SPANNED), int(Ending.RUNNING))
     code = jnp.where(finite, start, int(Ending.NON_FINITE))
@@ -205,7 +205,7 @@ def _advance(
     state: State,
     arguments: tuple[Any, ...],
     options: Options,
-    stop: Any,
+    stop: Array,
 ) -> State:
     def try_step(state: State) -> State:
         step = _propose(state, damping)
@@ -217,7 +217,7 @@ def _advance(
     )
 
 
-def _downhill(state: State) -> Any:
+def _downhill(state: State) -> Array:
     return state.normal.gradient - state.ridge * state.w
 
 
@@ -229,7 +229,7 @@ def _propose(state: State, damping: Damping) -> Any:
 
 
 @partial(jax.jit, static_argnames="damping")
-def _judge(state: State, step: Any, trial: Normal, options: Options, damping: Damping) -> State:
+def _judge(state: State, step: Array, trial: Normal, options: Options, damping: Damping) -> State:
     """Return the state after a tried step: moved where the objective is lower, else damped more."""
     w, normal, alpha, downhill = state.w, state.normal, state.ridge, _downhill(state)
     if damping.diagonal:
@@ -261,7 +261,7 @@ def _judge(state: State, step: Any, trial: Normal, options: Options, damping: Da
     return State(moved, linear, control, ridge, state.iteration + 1, state.mark)
 
 
-def _prior(alpha: Any, w: Any) -> Any:
+def _prior(alpha: Array, w: Array) -> Array:
     """Return `Σ α_i w_i²`."""
     return alpha * (w @ w) if alpha.ndim == 0 else w @ (alpha * w)
 
@@ -296,13 +296,13 @@ def effective_weights(normal: Normal, alpha: Any) -> Any:
     return damped_step.effective_weights(normal.hessian, alpha, floor, jnp)
 
 
-def is_spanned(normal: Normal) -> Any:
+def is_spanned(normal: Normal) -> Array:
     """Return whether P⊥J = 0: the learner lies in the span of the physics (Example 1)."""
     curvature = jnp.max(jnp.diag(normal.hessian), initial=0.0)
     return curvature <= _NOTHING_LEFT * _largest_column(normal)
 
 
-def _largest_column(normal: Normal) -> Any:
+def _largest_column(normal: Normal) -> Array:
     """Return the largest ‖J_i‖², before the projection."""
     return jnp.max(
         jnp.diag(normal.hessian) + jnp.sum(normal.overlap.jacobian**2, axis=0), initial=0.0

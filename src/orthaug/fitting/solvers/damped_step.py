@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from orthaug._base.jax import jax
+from orthaug._base.jax import AnyArray, Array, ArrayModule, jax
 from orthaug.fitting.status import Ending
 
 _SMALLEST_CURVATURE = 1e-14  # of the largest: it damps a direction that does nothing
@@ -35,7 +35,7 @@ class Damping(NamedTuple):
     largest: float
     diagonal: bool
 
-    def unit(self, hessian: Any, xp: Any) -> Any:
+    def unit(self, hessian: AnyArray, xp: ArrayModule) -> AnyArray | float:
         """Return the unit of μ."""
         return 1.0 if self.diagonal else xp.max(xp.diag(hessian), initial=1e-300)
 
@@ -48,24 +48,33 @@ MARQUARDT = Damping(1e-3, 1e16, diagonal=True)
 class StepControl(NamedTuple):
     """The state of the damping and of the stopping rule."""
 
-    damping: Any
+    damping: AnyArray | float
     """μ of the next step."""
-    growth: Any
+    growth: AnyArray
     """The factor that raises μ if the next step is rejected."""
-    small: Any
+    small: AnyArray
     """Accepted steps in a row that lowered the objective by less than the tolerance."""
-    accepted: Any
-    code: Any
+    accepted: AnyArray
+    code: AnyArray
     """An `Ending`."""
 
     @classmethod
-    def begin(cls, damping: Damping, hessian: Any, code: Any, xp: Any) -> StepControl:
+    def begin(
+        cls, damping: Damping, hessian: AnyArray, code: AnyArray, xp: ArrayModule
+    ) -> StepControl:
         """Return the control before the first step."""
         first, none = damping.first * damping.unit(hessian, xp), xp.asarray(0)
         return cls(first, xp.asarray(2.0), none, none, code)
 
 
-def propose(hessian: Any, ridge: Any, downhill: Any, mu: Any, damping: Damping, xp: Any) -> Any:
+def propose(
+    hessian: AnyArray,
+    ridge: AnyArray,
+    downhill: AnyArray,
+    mu: AnyArray | float,
+    damping: Damping,
+    xp: ArrayModule,
+) -> AnyArray:
     """Return the damped step; not finite where rounding leaves no Cholesky factor.
 
     Args:
@@ -85,7 +94,7 @@ def propose(hessian: Any, ridge: Any, downhill: Any, mu: Any, damping: Damping, 
     return unit * _solve(hessian * xp.outer(unit, unit) + mu * unity, unit * downhill, xp)
 
 
-def _solve(matrix: Any, right: Any, xp: Any) -> Any:
+def _solve(matrix: AnyArray, right: AnyArray, xp: ArrayModule) -> AnyArray:
     if xp is not np:
         return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right)
     try:
@@ -113,15 +122,15 @@ def judge(
     control: StepControl,
     damping: Damping,
     *,
-    decrease: Any,
-    predicted: Any,
-    before: Any,
-    accepted: Any,
-    stuck: Any,
-    level: Any,
-    unit: Any,
+    decrease: AnyArray | float,
+    predicted: AnyArray | float,
+    before: AnyArray | float,
+    accepted: AnyArray,
+    stuck: AnyArray | bool,
+    level: AnyArray | bool,
+    unit: AnyArray | float,
     tolerance: Any,
-    xp: Any,
+    xp: ArrayModule,
 ) -> StepControl:
     """Return the control after a tried step.
 
@@ -149,7 +158,9 @@ def judge(
     return StepControl(mu, growth, small, count, xp.where(stuck, end, code))
 
 
-def level_entries(hessian: Any, downhill: Any, objective: Any, xp: Any) -> Any:
+def level_entries(
+    hessian: AnyArray, downhill: AnyArray, objective: AnyArray | float, xp: ArrayModule
+) -> AnyArray:
     """Return a mask of the entries along which no step can descend.
 
     There, residual and Jacobian are orthogonal to rounding (MINPACK's gtol).
@@ -158,14 +169,16 @@ def level_entries(hessian: Any, downhill: Any, objective: Any, xp: Any) -> Any:
     return xp.abs(downhill) <= _LEVEL * size
 
 
-def effective_weights(hessian: Any, ridge: Any, floor: Any, xp: Any) -> Any:
+def effective_weights(
+    hessian: AnyArray, ridge: AnyArray | float, floor: AnyArray | float, xp: ArrayModule
+) -> AnyArray | float:
     """Return γ = tr(H (H + αI)⁻¹). Directions of a curvature up to `floor` count as absent."""
     values = xp.linalg.eigvalsh(xp.where(xp.isfinite(hessian), hessian, 0.0))
     seen = values > floor
     return xp.sum(xp.where(seen, values, 0.0) / xp.where(seen, values + ridge, 1.0))
 
 
-def effective_of_each(hessian: Any, ridge: Any, xp: Any) -> Any:
+def effective_of_each(hessian: Array, ridge: Array, xp: ArrayModule) -> Array:
     """Return the diagonal of `H (H + A)⁻¹` for a ridge of each weight.
 
     From the eigenvalues of `A^-½ H A^-½`.
@@ -180,13 +193,13 @@ def effective_of_each(hessian: Any, ridge: Any, xp: Any) -> Any:
 def evidence_ridge(
     loss: Any,
     effective: Any,
-    size: Any,
+    size: AnyArray | float,
     samples: Any,
     xp: Any,
     *,
     total: Any = None,
     share: Any = 1.0,
-) -> Any:
+) -> AnyArray | float:
     """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)` with `σ² = ‖r‖² / (N − γ/κ)`.
 
     κ is the share of the residuals that is independent. With groups γ and ‖w‖² are those of each

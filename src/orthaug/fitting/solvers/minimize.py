@@ -185,12 +185,12 @@ class SquaredResiduals(Protocol):
         """Number of leading entries of p that are θ: they have bounds and no ridge."""
         ...
 
-    def evaluate(self, p: Vector, start: Any) -> Any:
-        """Return a trial (`Trial`) at p, from the `start` that the last accepted one left."""
+    def evaluate(self, p: Vector, start: Any) -> Trial:
+        """Return a trial at p, from the `start` that the last accepted one left."""
         ...
 
-    def linearise(self, point: Any) -> Any:
-        """Return the derivative (`LinearModel`) about a trial."""
+    def linearise(self, point: Any) -> LinearModel:
+        """Return the derivative about a trial."""
         ...
 
     def samples(self, point: Any) -> tuple[float, float]:
@@ -233,8 +233,8 @@ class Pause(NamedTuple):
 class _Iterate(NamedTuple):
     """An accepted trial, and the state of the rest of the run."""
 
-    point: Any
-    linear: Any
+    point: Trial
+    linear: LinearModel
     ridge: float
     control: StepControl
     iteration: int
@@ -268,7 +268,7 @@ class _Rules:
     upper: Vector
     ceiling: float
 
-    def begin(self, p: Vector, start: Any, *, evidence_begun: bool) -> _Iterate | Any:
+    def begin(self, p: Vector, start: Any, *, evidence_begun: bool) -> _Iterate | Trial:
         """Return the first iterate, or the trial at the start where that is not finite."""
         point = self.objective.evaluate(np.clip(p, self.lower, self.upper), start)
         linear = self.objective.linearise(point) if np.isfinite(point.loss) else None
@@ -304,7 +304,10 @@ class _Rules:
             tried = tried._replace(begun=begun, control=control)
         if not tried.begun or not moved:
             return tried
-        return tried._replace(ridge=_next_ridge(self.objective, tried))
+        objective = self.objective
+        effective = effective_weights(tried.linear.hessian, tried.ridge, objective.physics)
+        ridge = evidence_ridge(objective, tried.point, effective, coloured=tried.coloured)
+        return tried._replace(ridge=ridge)
 
     def _try_step(self, iterate: _Iterate) -> _Iterate:
         """Return one damped step: accept it, or damp more."""
@@ -461,11 +464,6 @@ def _resume(objective: Any, paused: Pause) -> _Iterate:
         bool(begun),
         bool(paused.coloured),
     )
-
-
-def _next_ridge(objective: SquaredResiduals, iterate: _Iterate) -> float:
-    effective = effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics)
-    return evidence_ridge(objective, iterate.point, effective, coloured=iterate.coloured)
 
 
 def evidence_ridge(
