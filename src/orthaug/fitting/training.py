@@ -158,7 +158,8 @@ def train(
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
         runs_freely = task.criterion.free_run is not None and task.start_loss is not None
-        if choice.fallback and runs_freely and not held_out.ratio.value < 1:
+        replaces = choice.fallback and task.bound.learns and runs_freely
+        if replaces and not held_out.ratio.value < 1:
             replacing, best = [_fell_back(held_out)], -1
             LOG.info(
                 "no free run is better than physics alone on held-out rows: the result is "
@@ -357,6 +358,8 @@ def _held_out(
 
     `concluded` gives the estimate of a run by its number.
     """
+    if not task.bound.learns and len(runs) == 1:  # nothing to choose, and no learner to judge
+        return None
     if choice.validation is not None:
         record, unit = choice.validation, task.problem.deviation
         fits = [concluded(i) for i in range(len(starts))]

@@ -308,12 +308,12 @@ def _motion_blocks(motion: MotionFitResult, spec: Mapping[str, Any]) -> list[Any
         blocks.append(Table(f"The equations of motion, {integration}", head, rows))
     elif declared.get("source"):
         source = declared["source"]
-        beside = ", ".join(source.get("learned") or ()) or "no state"
+        beside = ", ".join(source.get("learned") or ())
+        learned = f"; the learner is beside {beside}" if beside else ""
         blocks.append(
             Text(
                 f"The equations of motion are those of `{source.get('file')}`, with the states "
-                f"{', '.join(motion.states)}; the learner is beside {beside}. They are integrated "
-                f"by {integration}",
+                f"{', '.join(motion.states)}{learned}. They are integrated by {integration}",
                 "note",
             )
         )
