@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Iterable
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -9,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import Warning
+from orthaug._base.lines import percent
 from orthaug.analysis.attempt import attempt, attempt_warned
-from orthaug.analysis.bias import bias_table
+from orthaug.analysis.bias import ResidualStep, bias_table
 from orthaug.analysis.budget import budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
@@ -34,6 +36,7 @@ from orthaug.inference.nearly_shared import shared_warnings
 from orthaug.models.learners import learns
 from orthaug.models.response import Response
 
+_SURELY = 5.0  # standard errors of a suspect's coefficient, beside errors that may be coloured
 _NOT_ANALYSED = Warning(
     "residual_not_analysed",
     "the residual is not analysed: there are too few rows, or it is rounding error only.",
@@ -259,7 +262,27 @@ def _of_motion(
         "the bias by suspects", lambda: _biases(fit, evidence.suspects), warnings, (None, None)
     )
     warnings += budget.warnings if budget else ()
+    warnings += _found_suspects(table or (), {one.name for one in evidence.suspects})
     return found | {"bias": table, "budget": budget}
+
+
+def _found_suspects(table: Iterable[dict[str, Any]], declared: Container[str]) -> list[Warning]:
+    """Return a warning for each declared suspect that a free run's residual surely contains."""
+    found = []
+    for entry in table:
+        step: ResidualStep | None = entry["residual"]
+        if step is None or entry["name"] not in declared or abs(step.t or 0.0) < _SURELY:
+            continue
+        unit = f" {entry['unit']}" if entry["unit"] else ""
+        std = f" (std {step.std:.2g})" if step.std is not None else ""
+        size = f"{step.coefficient:.3g}{unit}{std}"
+        text = (
+            f"the suspect {entry['name']} is in the residual of the free run: a linear step gives "
+            f"it the coefficient {size}, and lowers the squared error by {percent(step.share)}. A "
+            "large term is found better by a refit: write it into the physics."
+        )
+        found.append(Warning("suspect_found", text))
+    return found
 
 
 def _biases(
