@@ -189,7 +189,7 @@ def curves_figure(
                 "zeroline": False,
                 "automargin": True,
             },
-            **{"title": _compact_layout(label), "nticks": 5, "anchor": "x"},
+            **{"title": _compact_layout(label), "nticks": 5, "anchor": "x", "exponentformat": "e"},
         }
         for curve in drawn:
             raw, entry = curve.get("raw", False), curve.get("entry")
@@ -243,7 +243,7 @@ def interval_figure(
         axis, top = (str(i + 1) if i else ""), 1 - i * (one + _AXIS) / whole
         title = f"{name} [{units[name]}]" if units.get(name, "1") != "1" else name
         layout[f"xaxis{axis}"] = {
-            **{"zeroline": False, "nticks": 5, "anchor": f"y{axis}"},
+            **{"zeroline": False, "nticks": 5, "anchor": f"y{axis}", "exponentformat": "e"},
             "title": _compact_layout(escape(title)) | {"standoff": 4},
         }
         layout[f"yaxis{axis}"] = {
