@@ -214,6 +214,8 @@ class MotionSection(KindSection):
 
     registries = {"integrator": INTEGRATORS}
     reads_all_rows: ClassVar[str] = "a motion"
+    by_evidence: ClassVar[bool] = True
+    takes_uneven_rows: ClassVar[bool] = True
     foreign_keys: ClassVar[Mapping[str, str]] = {"output": "beside [motion]; expected `equation`"}
     integrator: str = "rk4"
     substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"

@@ -195,7 +195,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
             every=part.every,
             prepare=spec.data.steps,
-            uneven=spec.motion is not None,
+            uneven=spec.declared_physics.takes_uneven_rows,
         )
         results.append(
             FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))

@@ -120,6 +120,8 @@ class BaselineSection(Section):
 
     learns: ClassVar[bool] = True
     reads_all_rows: ClassVar[str] = ""
+    by_evidence: ClassVar[bool] = False
+    takes_uneven_rows: ClassVar[bool] = False
     foreign_keys: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("equation", "factor", "unit"), "without [motion], which it belongs to"
     )
@@ -518,18 +520,14 @@ class Spec(Section):
         self, *, linear: bool, validated: bool, kind: str | None = None
     ) -> tuple[str | float, ...]:
         """Return the regularizations that every start is run with, in a structure."""
-        given = self.training.regularization
-        declared = (
+        return choose_regularizations(
+            self.training.regularization,
             self.declared_solver(),
             self.declared_criterion(),
             self.declared_structure(kind),
-        )
-        conditions: dict[str, Any] = {"linear": linear, "validated": validated}
-        return choose_regularizations(
-            given,
-            *declared,
-            **conditions,
-            motion=self.motion is not None,
+            linear=linear,
+            validated=validated,
+            by_evidence=self.declared_physics.by_evidence,
             learner=self.declared_learner(),
         )
 

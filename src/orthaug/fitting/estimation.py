@@ -262,7 +262,7 @@ def _fit_once(plan: FitPlan[Any]) -> Estimate:
         request.structure,
         linear=problem.linear,
         validated=validated,
-        motion=plan.by_evidence,
+        by_evidence=plan.by_evidence,
         learner=learner,
     )
     auto = check_regularizations(given, choices, validated or blocks > 0)

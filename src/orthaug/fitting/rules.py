@@ -116,7 +116,7 @@ def choose_regularizations(
     *,
     linear: bool,
     validated: bool,
-    motion: bool = False,
+    by_evidence: bool = False,
     learner: Learner | None = None,
 ) -> tuple[Any, ...]:
     """Return the regularizations of every start: those given, or those of "auto".
@@ -126,14 +126,14 @@ def choose_regularizations(
     Args:
         linear: whether the physics is linear in θ, which is then solved.
         validated: whether a validation part chooses.
-        motion: whether the physics are equations of motion.
+        by_evidence: whether the kind of physics is regularized by evidence.
         learner: one that is linear in its weights needs none.
     """
     if not isinstance(given, str) or given != "auto":
         return tuple(given) if isinstance(given, list | tuple) else (given,)
     if getattr(learner, "linear", False):
         return ("none",)
-    if motion:
+    if by_evidence:
         return ("evidence",)
     if not solver.gauss_newton or structure.from_initial:
         return ("none",)
