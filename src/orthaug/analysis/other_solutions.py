@@ -20,6 +20,7 @@ from orthaug.fitting.motion_task import (
     descend_by_lengths,
     descend_from,
     draw_starts,
+    is_cheap,
 )
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
@@ -28,7 +29,6 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 _AS_GOOD = 1e-3  # of the residual: as good
 _BETTER = 0.02  # of the residual: clearly better
 _APART = 10.0  # standard errors by the curvature of the fit: another minimum, not a flat one
-_MOST_ROWS = 20_000  # above, the training from every start takes too long
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def find_other_solution(
 ) -> OtherSolution | None:
     """Return the best other minimum of physics alone that is as good as the one at `q`.
 
-    None where no start leads to one, or the record has too many rows for so many trainings.
+    None where no start leads to one, or so many trainings would take too long.
 
     Args:
         segmented: with physics, and perhaps a learner; it runs without.
@@ -80,7 +80,7 @@ def find_other_solution(
         q: coordinates of the parameters that physics alone was fitted with (np,).
     """
     own, coordinates = segmented.physics_only, segmented.problem.motion.coordinates
-    if segmented.sums is not None or len(segmented.record) > _MOST_ROWS:
+    if segmented.sums is not None or not is_cheap(segmented):
         return None
     solver = solver.at_most(RESTART_ITERATIONS)
     with np.errstate(all="ignore"):

@@ -49,6 +49,8 @@ _SHORT_ITERATIONS = 15  # over segments that are not the last
 _SETTLING = 200
 _STARTS = 8  # drawn, where the declared initial values lead nowhere
 _WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
+_CHEAP = 1_000_000  # operations of a pass over the record's equations
+_FEWEST = 50  # operations of equations, whose bookkeeping takes as much
 RESTART_ITERATIONS = 30  # from each
 _SEED = 20_261_127
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
@@ -65,7 +67,7 @@ def train_motion_physics(
     """
     own, coordinates = segmented.physics_only, segmented.problem.motion.coordinates
     best = descend_by_lengths(own, solver, coordinates.initial, progress)
-    if best is None or not _follows(own, best):
+    if is_cheap(own) and (best is None or not _follows(own, best)):
         best = _descend_from_others(own, solver, best)
     if best is None:
         return segmented, None
@@ -78,6 +80,14 @@ def train_motion_physics(
     segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
     mean_square = segmented.physics_only.mean_square(point.theta, ())
     return segmented, best._replace(mean_square=mean_square, **spent)
+
+
+def is_cheap(segmented: SegmentedMotion) -> bool:
+    """Return whether a training takes so little that several from other starts do not matter."""
+    motion = segmented.problem.motion
+    if motion.source is not None:  # each evaluation takes as long as those of many expressions
+        return False
+    return len(segmented.record) * max(motion.size, _FEWEST) <= _CHEAP
 
 
 def draw_starts(coordinates: Coordinates, middles: Sequence[Vector]) -> Iterator[Vector]:
