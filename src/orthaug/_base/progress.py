@@ -66,6 +66,13 @@ def follow_training(
         log.setLevel(logging.INFO)
 
 
+def stop_following() -> None:
+    """Call no function any more."""
+    for log in (_STAGE_LOG, _MODEL_LOG):
+        log.handlers.clear()
+        log.setLevel(logging.NOTSET)
+
+
 ProgressCallback = Callable[[int, int, float], None]
 """Called now and then with the number of the run, its iteration and the loss; it may raise to stop
 the training.

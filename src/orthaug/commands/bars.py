@@ -22,6 +22,7 @@ from orthaug._base.progress import (
     ProgressCallback,
     StopTraining,
     follow_training,
+    stop_following,
 )
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH
@@ -131,6 +132,8 @@ class _Lines:
         self._first, self._plan = 0, ()
         if self._wanted:
             follow_training(lambda stage: streams.say(json.dumps({"stage": stage})), _tell_model)
+        else:  # an earlier command of this process may have been followed
+            stop_following()
 
     def planned(self, first: int, plan: Plan) -> None:
         """Set the runs that follow from this number on."""
