@@ -246,7 +246,8 @@ def _of_motion(
             "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
         )
         found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
-    if fit.alone is not None and not fit.model.coloured:
+    # what is not identified has other solutions anyway
+    if fit.alone is not None and not fit.model.coloured and not fit.unidentified:
         alone, solver = fit.alone, LevenbergMarquardt().within_limit
         attempt_warned(
             "the search for other solutions",

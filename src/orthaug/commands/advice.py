@@ -253,7 +253,7 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
-_FAR_OFF = 3.0  # times the fit's own error: what a refit does not reach is no basis for trials
+_FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
 _LISTED = 3  # changes without gain that the text names
 
 
