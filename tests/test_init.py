@@ -951,3 +951,15 @@ def test_the_stated_error_is_what_a_fit_gives_on_the_same_rows(tmp_path, monkeyp
     fitted = json.loads(run("fit", "spec.toml", "--json", "--out", "out").out)
     nrmse = fitted["scores"]["tests.last"]["simulation"]["nrmse"][0]
     assert float(f"{100 * nrmse:.3g}") == float(stated[1])
+
+
+def test_a_time_that_begins_anew_separates_experiments(tmp_path):
+    u, y = plant(300)
+    time = np.concatenate([0.5 * np.arange(120), 0.5 * np.arange(180)])
+    frame = pd.DataFrame({"t": time, "u": u, "y": y})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert "the time begins anew in row 120: the rows between are experiments" in done.out
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["sampling_time"], data["train"]["rows"]) == (0.5, [[0, 120], [120, 225]])

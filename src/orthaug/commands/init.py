@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,9 @@ def _data(
         if part[0] == part[1]:
             continue
         entry = tomlkit.inline_table()
-        entry.update({"files": [file], "rows": part})
+        pieces = _pieces(found, *part)
+        rows_of = [list(piece) for piece in pieces]
+        entry.update({"files": [file], "rows": rows_of if len(pieces) > 1 else rows_of[0]})
         if name == "train":
             data.add("train", entry)
         else:
@@ -506,6 +509,12 @@ def _extent(roles: Roles) -> tuple[int, int]:
     return rows, int((~there).sum())
 
 
+def _pieces(found: Survey, start: int, stop: int) -> list[tuple[int, int]]:
+    """Return half-open ranges of rows, cut where the time begins anew."""
+    ends = [start, *(row for row in found.clock.restarts if start < row < stop), stop]
+    return list(pairwise(ends))
+
+
 def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) -> tuple[Record, int]:
     """Return a range of rows, and how many are left out because a sample is missing."""
     inputs, outputs = (
@@ -513,7 +522,7 @@ def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) ->
         for group in (roles.inputs, roles.outputs)
     )
     options: dict[str, Any] = {
-        "rows": rows,
+        "rows": _pieces(found, *rows),
         "missing": "skip" if missing or not found.clock.even else "error",
     }
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
@@ -548,6 +557,9 @@ def _account(
         f"{found.path.name}: {rows} rows, {len(found.columns)} columns{horizon}",
         f"sampling time: {step}",
     ]
+    if found.clock.restarts:
+        where = first_words([str(row) for row in found.clock.restarts], _LISTED)
+        lines.append(f"the time begins anew in row {where}: the rows between are experiments")
     for kind, columns in (("input", roles.inputs), ("output", roles.outputs)):
         lines += [f"{kind:<7}{as_seen(column, spikes=kind == 'output')}" for column in columns]
     used = {id(c) for c in (*roles.inputs, *roles.outputs, found.clock.column)}

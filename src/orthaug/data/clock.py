@@ -30,6 +30,7 @@ _FEWEST = 10  # rows from which on rising evenly is no chance
 _MOSTLY = 0.98
 # Share of rising steps from which on a column named as the time is a time with a fault.
 _RISES = 0.9
+_SHORTEST = 10  # rows of an experiment, where a time that falls begins anew
 _COUNTING = (0.0, 1.0)  # where counters of rows begin
 
 
@@ -67,6 +68,19 @@ class Clock:
     def instants(self) -> bool:
         """True if the column holds instants."""
         return self.seconds is not None
+
+    @property
+    def restarts(self) -> tuple[int, ...]:
+        """Rows at which a column named as the time begins anew: those of further experiments."""
+        for one in self.refused:
+            values = one.column.values
+            falls = (np.flatnonzero(np.diff(values) < 0) + 1).tolist() if one.fault else []
+            if not falls or np.diff([0, *falls, one.column.filled]).min() < _SHORTEST:
+                continue
+            first = float(values[0] + abs(values[1] - values[0]))
+            if all(values[row] <= first for row in falls):
+                return tuple(falls)
+        return ()
 
     @property
     def steady(self) -> bool:
