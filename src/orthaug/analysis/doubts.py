@@ -280,8 +280,10 @@ def _reason(result: Findings, test: StructureTest | None, left: float, unmodelle
     if unmodelled:
         return "the residual contains more than noise"
     stopped = {"not_converged", "stopped"} & {warning.code for warning in result.warnings}
-    if result.status.code == "iteration_limit" or stopped:
+    if stopped:
         return "training had not converged"
+    if result.status.code == "iteration_limit":
+        return "training ended at its limit of iterations, though its loss hardly fell any more"
     return ""
 
 
