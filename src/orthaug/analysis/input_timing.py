@@ -197,7 +197,7 @@ class LateInput:
 
     @property
     def by_lag(self) -> bool:
-        """Whether a lag explains the data better than a delay."""
+        """True if a lag explains the data better than a delay."""
         return self.lagged < self.delayed
 
     @property

@@ -256,7 +256,7 @@ class MissingTest:
 
     @property
     def scattered(self) -> bool:
-        """Whether terms that are small one by one surely explain a large share together.
+        """True if terms that are small one by one surely explain a large share together.
 
         A force of another form than those tried, such as a gap, is made up of several of them. The
         level is far below the usual one, since long-lived disturbances resemble such terms.

@@ -44,7 +44,7 @@ class OtherSolution:
 
     @property
     def better(self) -> bool:
-        """Whether it explains the data clearly better than the fit."""
+        """True if it explains the data clearly better than the fit."""
         return self.residual < (1 - _BETTER) * self.fitted
 
     @property
