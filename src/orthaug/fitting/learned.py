@@ -76,6 +76,7 @@ class PlannedRun(NamedTuple):
     regularization: str | float
 
 
+@runtime_checkable
 class FinishedRun(Protocol):
     """A run as it ended: `TrainingRun` and `FreeRunFit`."""
 
