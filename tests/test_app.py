@@ -1080,6 +1080,7 @@ def test_example_data_lead_on_and_every_change_is_taken_back(server, browser):
     page.wait_for_function("Math.abs(scrollY - 400) < 3")
     assert page.evaluate("location.hash") == "#Model"
     assert "stone" not in page.get_by_label("spec in TOML").input_value()
+    page.wait_for_timeout(1000)  # the place is held for half a second after it was reached
     tab.go("Data")
     page.wait_for_function("scrollY === 0")
     tab.check("Model")

@@ -101,9 +101,10 @@ function shown(part, first) {
 function arrive() {
   const place = +sessionStorage.getItem(memory("scroll"));
   arriving = Date.now() + 3000;
+  let there = 0; // since when; what is drawn late may still move it for a moment
   const seek = () => {
     scrollTo(0, place);
-    if (Math.abs(scrollY - place) < 2) arriving = place ? arriving : 0;
+    if (Math.abs(scrollY - place) < 2) arriving = place ? Math.min(arriving, (there ||= Date.now()) + 500) : 0;
     if (Date.now() < arriving) requestAnimationFrame(seek);
   };
   requestAnimationFrame(seek);
