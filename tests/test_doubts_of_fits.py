@@ -227,3 +227,43 @@ def test_a_drift_is_named(slope):
     texts = [w.text for w in found.warnings if w.code == "drift"]
     assert len(texts) == (slope > 0)
     assert all("drifts: a straight line over time makes up" in text for text in texts)
+
+
+def test_a_gap_between_two_angles_is_missing_physics():
+    """No single term explains it, and all of those in the twist of the shaft do together."""
+    rng = np.random.default_rng(1)
+    torque = np.repeat(rng.uniform(-2, 2, 50), 40)
+    a1 = w1 = a2 = w2 = 0.0
+    angles = []
+    for u in torque:
+        angles.append((a1, a2))
+        for _ in range(10):
+            twist = a1 - a2
+            shaft = 40 * np.sign(twist) * max(abs(twist) - 0.02, 0)
+            shaft += 0.05 * (w1 - w2) * (abs(twist) > 0.02)
+            w1 += 2e-4 * (u - shaft - 0.02 * w1) / 0.01
+            w2 += 2e-4 * (shaft - 0.1 * w2) / 0.05
+            a1, a2 = a1 + 2e-4 * w1, a2 + 2e-4 * w2
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("a1", "w1", start="motor"),
+            oa.State("w1", "(u - shaft - d1*w1)/J1", start="derivative of motor"),
+            oa.State("a2", "w2", start="load"),
+            oa.State("w2", "(shaft - d2*w2)/J2", start="derivative of load"),
+        ],
+        outputs=[oa.Output("motor", "a1"), oa.Output("load", "a2")],
+        inputs=["u"],
+        define={"shaft": "k*(a1 - a2) + c*(w1 - w2)"},
+        parameters=[
+            oa.PhysicalParameter(name, value, min=0)
+            for name, value in dict(J1=0.012, J2=0.04, k=30, c=0.1, d1=0.03, d2=0.05).items()
+        ],
+    )
+    assert {("a1", "a2"), ("w1", "w2")} <= set(motion.differences)
+    noisy = np.array(angles) + 2e-4 * rng.normal(size=(len(torque), 2))
+    record = oa.Record.from_arrays(
+        torque, noisy, sampling_time=0.002, inputs=["u"], outputs=["motor", "load"]
+    )
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    assert found.residuals.verdict == "unmodelled"
+    assert all(row.ci95_counts == "noise only" for row in found.parameters if row.ci95)
