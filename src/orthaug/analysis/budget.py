@@ -580,7 +580,7 @@ def _as_physics(causes: Causes) -> tuple[str, ...]:
     A term with memory is no expression of one row.
     """
     suspects = [entry.suspect for entry in causes.entries]
-    if causes.share < _WHOLE or any(getattr(one, "memory", None) is not None for one in suspects):
+    if causes.share < _WHOLE or any(one.memory is not None for one in suspects):
         return ()
     named = " and ".join(
         one.expression + (f" in the equation of {entry.equation}" if entry.equation else "")

@@ -147,8 +147,8 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             kind = "innovations" if result.motion is not None else "auto"
             return (
                 f"{what}, and neither the inputs nor functions of the regressors predict it: a "
-                "disturbance with a memory of its own is likely. The 95 % intervals count white "
-                f'noise only. Describe it by `noise.model` = "{kind}"; if physics with memory is '
+                "disturbance with a memory of its own is likely. The 95 % intervals count noise "
+                f'only. Describe it by `noise.model` = "{kind}"; if physics with memory is '
                 "missing instead, such as a hysteresis, that does not make the intervals right."
             )
     elif test.is_far:

@@ -207,11 +207,11 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         trial = try_holds(posed, criterion, solver, structure, waves)
         text, warnings = _about_steps(problem, trial)
         warnings += [late.warning for late in find_late_inputs(trial.task, solver)]
-        if trial.task.physics is not None:
+        warnings += restart_warnings(trial.task.physics)
+        if full_rank and trial.task.physics is not None:  # else there are others anyway
             q = trial.task.physics.end.point.theta
             other = find_other_solution(trial.task.plan, solver, q)
             warnings += other.warnings if other else ()
-            warnings += restart_warnings(trial.task.physics)
         if identification.by_any is None:
             warnings.append(_NOT_RICH)
         found = {
