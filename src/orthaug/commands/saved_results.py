@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -17,6 +16,7 @@ from orthaug.commands.compare import choose_row, row_of
 from orthaug.commands.folder import results_beside
 from orthaug.commands.job import surroundings, toml_of
 from orthaug.commands.parts import load_parts
+from orthaug.commands.sections import values_by_key
 from orthaug.commands.spec import Spec, spec_model
 from orthaug.fitting.status import Ending
 from orthaug.models import storage
@@ -241,7 +241,9 @@ def _differences(rows: Sequence[RowResult]) -> Iterator[DifferenceResult]:
 
 def _settings(found: Sequence[SavedResult]) -> list[SettingResult]:
     """Return the keys in which specs differ, except the names of files; and the version."""
-    given = [{"orthaug": one.result.orthaug, **dict(_keys_of(one.result.spec))} for one in found]
+    given = [
+        {"orthaug": one.result.orthaug, **dict(values_by_key(one.result.spec))} for one in found
+    ]
     keys = dict.fromkeys(key for own in given for key in own)
     values = {key: [own.get(key) for own in given] for key in keys}
     return [
@@ -249,15 +251,6 @@ def _settings(found: Sequence[SavedResult]) -> list[SettingResult]:
         for key, own in values.items()
         if any(value != own[0] for value in own) and not key.endswith(".files")
     ]
-
-
-def _keys_of(content: Any, before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a spec with dots, and their values; lists are whole."""
-    if isinstance(content, Mapping) and content:
-        for key, value in content.items():
-            yield from _keys_of(value, f"{before}.{key}" if before else str(key))
-    else:
-        yield before, content
 
 
 def _free_runs(

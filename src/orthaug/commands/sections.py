@@ -9,7 +9,7 @@ import json
 import math
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, Union
 
@@ -165,6 +165,18 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
     expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
     return f"'{key}': found {_file_text(given)}; expected {expected}"
+
+
+def values_by_key(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value of a spec with its key, such as `baseline.terms[0].regressor`."""
+    if isinstance(value, Mapping):
+        for key, own in value.items():
+            yield from values_by_key(own, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, Sequence) and any(isinstance(own, Mapping) for own in value):
+        for i, own in enumerate(value):
+            yield from values_by_key(own, f"{path}[{i}]")
+    else:
+        yield path, value
 
 
 def _file_text(value: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -13,6 +13,7 @@ from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug.commands.app.spec_text import plain
+from orthaug.commands.sections import values_by_key
 
 _KEPT = 10  # results of one spec
 _SHOWN = 3  # changes of a spec that are listed
@@ -92,27 +93,15 @@ def _score(result: Mapping[str, Any]) -> str:
 def _change(before: str, after: str) -> str:
     """Return in words what differs between two specs."""
     try:
-        old, new = dict(_leaves(plain(before))), dict(_leaves(plain(after)))
+        old, new = dict(values_by_key(plain(before))), dict(values_by_key(plain(after)))
     except InputError:
         return ""
     keys = [key for key in dict.fromkeys((*old, *new)) if old.get(key) != new.get(key)]
-    told = [f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}" for key in keys[:_SHOWN]]
+    listed = [f"{key}: {_shown(old.get(key))} → {_shown(new.get(key))}" for key in keys[:_SHOWN]]
     if len(keys) > _SHOWN:
-        told.append(f"{len(keys) - _SHOWN} more")
-    return ", ".join(told) or "the same spec again"
+        listed.append(f"{len(keys) - _SHOWN} more")
+    return ", ".join(listed) or "the same spec again"
 
 
 def _shown(value: Any) -> str:
     return "none" if value is None else str(value)
-
-
-def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every value of a spec with its key."""
-    if isinstance(value, Mapping):
-        for key, own in value.items():
-            yield from _leaves(own, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, Sequence) and any(isinstance(own, Mapping) for own in value):
-        for i, own in enumerate(value):
-            yield from _leaves(own, f"{path}[{i}]")
-    else:
-        yield path, value

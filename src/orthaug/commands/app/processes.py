@@ -113,18 +113,18 @@ class Command:
             self.finish()
         async for raw in self.process.stderr:
             line = raw.decode("utf-8", "replace").rstrip()
-            told = _told(line)
-            if told is None:
+            message = _message_in(line)
+            if message is None:
                 self.lines = [*self.lines, line][-_LINES:]
-            elif "stage" in told:
-                self._enter(Stage(told["stage"]))
-            elif "model" in told:
+            elif "stage" in message:
+                self._enter(Stage(message["stage"]))
+            elif "model" in message:
                 if self.stage is None:  # else it is of a trial
-                    self.models.pop(told["model"], None)
-                    self.models[told["model"]] = told
+                    self.models.pop(message["model"], None)
+                    self.models[message["model"]] = message
             else:
-                self.progress, self.stage = told, None
-                self.losses.append((Run.of(told), told["iteration"], told["loss"]))
+                self.progress, self.stage = message, None
+                self.losses.append((Run.of(message), message["iteration"], message["loss"]))
             self.changed()
         return await self.process.wait()
 
@@ -156,7 +156,7 @@ class Command:
                 _kill(self.process)
 
 
-def _told(line: str) -> dict[str, Any] | None:
+def _message_in(line: str) -> dict[str, Any] | None:
     """Return what a line tells of the training: a run, a stage or a model; None for others."""
     with suppress(ValueError):
         return json.loads(line) if line.startswith(('{"run"', '{"stage"', '{"model"')) else None
