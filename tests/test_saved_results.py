@@ -131,6 +131,8 @@ def test_where_data_are_not_found_the_rest_is_compared(results, tmp_path, monkey
         done.out.split()
     )
     assert [w["code"] for w in result_of(Path("out"))["warnings"]] == ["data_not_found"]
+    page = Path("out/report.html").read_text(encoding="utf-8")
+    assert "2 models of y from u" in page and page.count('data-label="horizon">free run<') >= 2
     assert "The free runs of" not in Path("out/report.html").read_text(encoding="utf-8")
 
 
