@@ -133,12 +133,12 @@ FLOWN = (
 )
 
 
-def rows(draws: int = 100, flown: int = 30) -> Iterator[Row]:
+def rows(draws: int = 100, motions: int = 30) -> Iterator[Row]:
     """Yield the lines of the table, as `select` is by default; the free run is slower."""
     for name, noise, criterion, system in CASES:
         yield row(name, noise, draws, criterion, {}, **system)
     name, noise, criterion, system = FLOWN
-    yield row(name, noise, flown, criterion, {}, **system)
+    yield row(name, noise, motions, criterion, {}, **system)
 
 
 def naive(draws: int = 100) -> Iterator[Row]:

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,28 +167,20 @@ def row(system: str, noise: str, sees: str, draws: int) -> Row:
     )
 
 
-def rows(draws: int = 10, words: str = "") -> list[Row]:
-    """Return all rows of the table, or those whose system, noise and learner hold some words."""
-    found = []
+def rows(draws: int = 10, words: str = "") -> Iterator[Row]:
+    """Yield the rows of the table, or those whose system, noise and learner hold some words."""
     for system in SYSTEMS:
         for noise in NOISES[system.split(",", 1)[0]]:
             for sees in LEARNERS:
                 if all(word in f"{system} {noise} {sees}" for word in words.split()):
-                    began = time.perf_counter()
-                    found.append(row(system, noise, sees, draws))
-                    print(
-                        *found[-1],
-                        f"{(time.perf_counter() - began) / draws:.1f} s",
-                        sep=" | ",
-                        flush=True,
-                    )
-    return found
+                    yield row(system, noise, sees, draws)
 
 
 if __name__ == "__main__":
     print(describe())
     print(
         "system | noise | learner sees | draws | held | silent misses | median width | warned "
-        "| hidden_state | a draw"
+        "| hidden_state"
     )
-    rows(int(sys.argv[1]) if len(sys.argv) > 1 else 10, " ".join(sys.argv[2:]))
+    for one in rows(int(sys.argv[1]) if len(sys.argv) > 1 else 10, " ".join(sys.argv[2:])):
+        print(*one, sep=" | ", flush=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -163,9 +163,8 @@ def _judged(
     return float(value), held, warned
 
 
-def rows(draws: int = 10) -> list[Row]:
-    """The table: every column with noise of 1 and 5 %, as lagged physics, and some as a motion."""
-    found = []
+def rows(draws: int = 10) -> Iterator[Row]:
+    """Yield the table: every column with noise of 1 and 5 %, as lagged physics, and some as a motion."""
     cases = [("lagged", lagged, column, noise) for column in COLUMNS for noise in (0.01, 0.05)]
     moved = ("sign of the speed", "speed times its size", "independent noise", "independent steps")
     cases += [("motion", motion, column, 0.01) for column in moved]
@@ -179,19 +178,16 @@ def rows(draws: int = 10) -> list[Row]:
             silent += not holds and not said and np.isfinite(low)
             widths.append((high - low) / TRUTH)
         sees = SEES if kind == "lagged" else "v"
-        found.append(
-            Row(
-                f"{kind}: {column}",
-                f"{noise:.0%}",
-                sees,
-                len(widths),
-                held,
-                warned,
-                silent,
-                float(np.nanmedian(widths)),
-            )
+        yield Row(
+            f"{kind}: {column}",
+            f"{noise:.0%}",
+            sees,
+            len(widths),
+            held,
+            warned,
+            silent,
+            float(np.nanmedian(widths)),
         )
-    return found
 
 
 def main() -> None:

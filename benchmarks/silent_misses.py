@@ -5,8 +5,8 @@ Five files have the systems: what a missing term moves (`coverage_causes`), colu
 (`coverage_noise`), and terms that `select` chose (`coverage_choice`). A row is a system, its noise and what the learner
 sees; held, silent misses and the median width relative to the value. Allowed: silent misses of 5 %, with the standard
 error of so many draws.
-Run: python benchmarks/silent_misses.py [lagged draws, default 100] [draws of motions, default 30]; with few draws it
-tells of gross misses only. Parts run in as many processes as there are cores.
+Run: python benchmarks/silent_misses.py [lagged draws, default 100] [draws of motions, default 30] [parts, default all];
+with few draws it tells of gross misses only. Parts run in as many processes as there are cores.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def measure(part: str, lagged: int, motions: int) -> list[Row]:
     return found
 
 
-def main(lagged: int, motions: int) -> int:
+def main(lagged: int = 100, motions: int = 30, *names: str) -> int:
     print(describe())
     print(
         "\n| system | noise | learner sees | draws | held | silent misses | width |\n"
@@ -120,7 +120,7 @@ def main(lagged: int, motions: int) -> int:
     began = time.perf_counter()
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), spawned, max_tasks_per_child=1) as processes:
-        parts = [processes.submit(measure, part, lagged, motions) for part in PARTS]
+        parts = [processes.submit(measure, part, lagged, motions) for part in names or PARTS]
         missed = [row for part in parts for row in part.result() if row.silent > row.most]
     minutes = (time.perf_counter() - began) / 60
     print(f"\n{minutes:.0f} min; rows above {ALLOWED:g} % by two standard errors: {len(missed)}")
@@ -133,4 +133,4 @@ def main(lagged: int, motions: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(word) for word in (sys.argv + ["100", "30"][len(sys.argv) - 1 :])[1:3])))
+    sys.exit(main(*map(int, sys.argv[1:3]), *sys.argv[3:]))
