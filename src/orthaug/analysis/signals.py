@@ -1,8 +1,8 @@
 """Excitation signals: functions that return (N,) samples within ±amplitude, in channel units.
 
 Which one to use is the paper's remark after `cond:special_PE`: one under which physics and
-suspected terms are orthogonal. `odd=True`, `sign_symmetric` and `space_filling` serve that; the
-others are the usual ones (Pintelon and Schoukens 2012, ch. 5; Ljung 1999, ch. 13). Anything random
+suspected terms are orthogonal. `odd=True` and `sign_symmetric` serve that; the others are the usual
+ones (Pintelon and Schoukens 2012, ch. 5; Ljung 1999, ch. 13). Anything random
 needs its `seed`, and the same seed gives the same samples.
 """
 
@@ -15,28 +15,10 @@ from typing import Any
 import numpy as np
 import scipy.signal
 
-from orthaug._base.checks import Matrix, Vector, as_signal, check_count, check_number
+from orthaug._base.checks import Vector, as_signal, check_count, check_number
 from orthaug._base.errors import InputError
 
 _MOST_BITS = 24  # of a shift register: 1.7e7 samples a period
-_MOST_ORDER = 20  # lags that `space_filling` fills
-
-
-def crest_factor(u: Vector) -> float:
-    """Return the largest magnitude over root mean square: 1 for a binary signal, 1.41 for a sine.
-
-    Raises:
-        InputError: a signal that is not finite, or zero everywhere.
-
-    Examples:
-        >>> crest_factor(np.array([1.0, -1.0, 1.0]))
-        1.0
-    """
-    u = _signal(u)
-    if not np.any(u):
-        raise InputError("a signal that is zero everywhere has no crest factor.")
-    largest = np.abs(u).max()
-    return float(1.0 / np.sqrt(np.mean(np.square(u / largest))))
 
 
 def multisine(
@@ -310,119 +292,6 @@ def limit_rate(u: Vector, largest_step: float, start: float | None = None) -> Ve
         )
         limited[k] = value
     return limited
-
-
-def space_filling(
-    samples: int, order: int, *, amplitude: float, seed: int, spread: float = 1.0
-) -> Vector:
-    """Return a sequence whose vectors of `order` successive samples fill their box evenly.
-
-    The box is [−amplitude, amplitude]^order.
-
-    A de Bruijn sequence (a random Eulerian circuit of the graph whose nodes are order − 1 symbols)
-    over `m = ⌊(N − order + 1)^(1/order)⌋` levels meets each of the m^order cells of the box exactly
-    once; within its level the successive visits take the van der Corput numbers. Use it where the
-    regressor is `u[k-nk] … u[k-nk-nb+1]`, with order = nb: nk is only a delay.
-
-    Args:
-        samples: N, at least 2^order + order − 1; what is left after one circuit runs through it
-            again.
-        order: lags to fill, 1 to 20. What it gains over white noise shrinks with every lag: the
-            fill distance is 0.63 of the white median at 1000 samples of 2 lags, 0.72 at 1500 of 3,
-            0.84 at 4000 of 5.
-        seed: of the circuit.
-        spread: share of a level's width that is used; 1 for all, the most uniform; 0 for the m
-            levels alone, the smallest fill distance and, over one circuit, exact symmetry.
-
-    Raises:
-        InputError: numbers out of range, too few samples to visit 2 levels in every lag.
-    """
-    amplitude, samples = _amplitude(amplitude), check_count(samples, "samples")
-    order, spread = check_count(order, "order"), check_number(spread, "spread")
-    rng = _generator(seed)
-    if order > _MOST_ORDER or spread > 1:
-        raise InputError(
-            f"`order` must be at most {_MOST_ORDER} and `spread` at most 1; got {order!r} and "
-            f"{spread!r}."
-        )
-    windows = samples - order + 1
-    if windows < 2**order:
-        raise InputError(
-            f"{samples} samples cannot fill {order} lags; give at least "
-            f"{2**order + order - 1}, or white_uniform."
-        )
-    levels = round(windows ** (1.0 / order))
-    levels -= levels**order > windows
-    circuit = _de_bruijn(levels, order, rng)
-    symbols = np.concatenate([circuit[len(circuit) - order + 1 :], np.resize(circuit, windows)])
-    offset = np.empty(samples)
-    for visits in np.split(
-        np.argsort(symbols, kind="stable"), np.cumsum(np.bincount(symbols))[:-1]
-    ):
-        offset[visits] = _van_der_corput(len(visits)) + 0.5 / len(visits) - 0.5
-    return (
-        np.clip((2.0 * (symbols + 0.5 + spread * offset) - levels) / levels, -1.0, 1.0) * amplitude
-    )
-
-
-def fill_distance(u: Vector, order: int, *, amplitude: float) -> float:
-    """Return the largest distance of a point of the box from all lag vectors of u, over amplitude.
-
-    The box is [−amplitude, amplitude]^order.
-
-    Euclidean, over 4096 points of a Sobol sequence: a lower bound of the true one, the same on
-    every call.
-
-    Raises:
-        InputError: numbers out of range, fewer samples than `order`.
-    """
-    from scipy.spatial import KDTree
-    from scipy.stats import qmc  # slow to import, and only needed here
-
-    amplitude, order = _amplitude(amplitude), check_count(order, "order")
-    points = qmc.Sobol(order, scramble=False).random(4096)
-    return float(KDTree(lag_vectors(u, order) / amplitude).query(2.0 * points - 1.0)[0].max())
-
-
-def lag_vectors(u: Vector, order: int) -> Matrix:
-    """Return rows `u[k], u[k-1], …, u[k-order+1]`, (N − order + 1, order).
-
-    Raises:
-        InputError: a signal that is not finite or shorter than `order`.
-    """
-    u, order = _signal(u), check_count(order, "order")
-    if len(u) < order:
-        raise InputError(f"{len(u)} samples hold no vector of {order} lags.")
-    return np.lib.stride_tricks.sliding_window_view(u, order)[:, ::-1]
-
-
-def _de_bruijn(levels: int, order: int, rng: np.random.Generator) -> np.ndarray:
-    """Return a cyclic sequence of `levels**order` symbols that holds every word of `order` once.
-
-    Hierholzer's algorithm on the graph of words of order − 1 symbols. The branches are shuffled, so
-    that a part of the sequence is even too: the usual lexicographic sequence spends its first part
-    on the lowest levels.
-    """
-    nodes = levels ** (order - 1)
-    branches = rng.permuted(np.tile(np.arange(levels), (nodes, 1)), axis=1).tolist()
-    path, taken, circuit = [0], [0], []
-    while path:
-        node = path[-1]
-        if branches[node]:
-            symbol = branches[node].pop()
-            path.append((node * levels + symbol) % nodes)
-            taken.append(symbol)
-        else:
-            path.pop()
-            circuit.append(taken.pop())
-    return np.array(circuit[-2::-1])  # backwards, without the start, which no branch led to
-
-
-def _van_der_corput(count: int) -> Vector:
-    """Return the first `count` radical inverses in base 2, as multiples of 1/count in [0, 1)."""
-    from scipy.stats import qmc
-
-    return np.argsort(np.argsort(qmc.Halton(1, scramble=False).random(count)[:, 0])) / count
 
 
 def _hold_bits(bits: Any, hold: int, samples: int) -> Vector:

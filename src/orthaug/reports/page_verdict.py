@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthaug._base.lines import plain_number
+from orthaug._base.lines import join_words, plain_number
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
@@ -63,7 +63,9 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
     because = (
-        f"{', but ' if level == 'care' else '; '}{_join(doubts[:_MOST_DOUBTS])}" if doubts else ""
+        f"{', but ' if level == 'care' else '; '}{join_words(doubts[:_MOST_DOUBTS])}"
+        if doubts
+        else ""
     )
     causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
     first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
@@ -109,7 +111,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
     trust += f"; {_quote_names(near)} {_verb_for(near)} as good within 10 %." if near else "."
     if doubts:
-        trust = f"{trust[:-1]}. But {_join(doubts[:_MOST_DOUBTS])}."
+        trust = f"{trust[:-1]}. But {join_words(doubts[:_MOST_DOUBTS])}."
     if result.differences is not None:
         return PageVerdict(level, trust, _agreement(result), _settings_text(result))
     alone = errors.get("physics alone")
@@ -252,7 +254,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
-        yield f"its free run diverges on {_join(runaway)}"
+        yield f"its free run diverges on {join_words(runaway)}"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
     if (
@@ -278,12 +280,12 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         probably = guessed and getattr(result, "motion", None) is None
         size = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
         verb = "is" if len(biased) == 1 else "are"
-        yield f"{_join(biased)} {verb} {'probably ' * probably}biased{size}"
+        yield f"{join_words(biased)} {verb} {'probably ' * probably}biased{size}"
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
             "unmodelled": "its one-step residual is no larger than the quantisation steps of "
-            f"{_join(coarse)}"
+            f"{join_words(coarse)}"
             if coarse
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
@@ -300,7 +302,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield (
-            f"{_join(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
+            f"{join_words(list(left))} {'leaves' if len(left) == 1 else 'leave'} the range of the "
             "training data"
         )
 
@@ -350,20 +352,21 @@ def _use_text(result: FitResult, level: str) -> str:
         text = "predict the next sample"
     else:
         text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
-    text += f" and to read {_join(known)} as physics" if known else ""
+    text += f" and to read {join_words(known)} as physics" if known else ""
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
         text += (
-            f". Do not read {_join(sure)} as physics yet: the {cover} not include what the "
+            f". Do not read {join_words(sure)} as physics yet: the {cover} not include what the "
             "residual still contains"
         )
     text += (
-        f". {_join(others)} {_verb_for(others)} too uncertain or too biased to be read as physics"
+        f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
+        "physics"
         if others
         else ""
     )
     if shared:
-        text += f". The data alone do not determine {_join(shared)}, because the learner could"
+        text += f". The data alone do not determine {join_words(shared)}, because the learner could"
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
     return f"Use it to {text}."
 
@@ -383,7 +386,7 @@ def _is_known(row: ParameterResult) -> bool:
 
 
 def _quote_names(names: list[str]) -> str:
-    return _join([f"“{name}”" for name in names])
+    return join_words([f"“{name}”" for name in names])
 
 
 def _verb_for(names: list[str]) -> str:
@@ -446,7 +449,7 @@ def _option(result: FitResult) -> str | None:
             "decide whether it helps"
         )
     if result.residuals is not None and result.residuals.steps:
-        steps = _join(list(result.residuals.steps))
+        steps = join_words(list(result.residuals.steps))
         return (
             f"fewer samples, or a finer measurement, because the quantisation steps of {steps} "
             "are as large as the one-step residual"
@@ -508,7 +511,3 @@ def _change(change: object) -> str:
     text = {key: getattr(change, key) for key in ("kind", "what", "fall", "of", "output")}
     predicted = Change(**{**text, "fall": text["fall"] or 0.0})
     return f"{predicted.name}, with which {predicted.prediction}"
-
-
-def _join(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
