@@ -1005,7 +1005,13 @@ def test_from_a_file_to_code_with_the_numbers_of_the_command_line(
     page.get_by_role("button", name="Train").click()
     page.wait_for_selector("text=Training is done")
     tab.go("Report")
-    assert page.frame_locator("iframe").locator("h1").inner_text() == "Model of y from u"
+    report = page.frame_locator("iframe")
+    assert report.locator("h1").inner_text() == "Model of y from u"
+    page.wait_for_function("document.querySelector('iframe').clientHeight > 2 * innerHeight")
+    whole, seen = report.locator("html").evaluate("html => [html.scrollHeight, innerHeight]")
+    assert whole <= seen  # it scrolls with the page alone
+    report.locator("nav a").last.click()
+    page.wait_for_function("scrollY > innerHeight")
     tab.check("Export")
     page.get_by_role("button", name="Write numpy").click()
     page.wait_for_selector("text=numpy.zip")

@@ -46,6 +46,13 @@ const frames = new ResizeObserver((entries) => entries.forEach(({ target }) => {
   frames.unobserve(target);
   requestAnimationFrame(() => requestAnimationFrame(() => (target.src = target.dataset.src)));
 }));
+// A report is as high as it says, so that it scrolls with the page; a link in it scrolls the page.
+addEventListener("message", ({ data, source }) => {
+  const frame = [...document.querySelectorAll("iframe.report")].find((one) => one.contentWindow === source);
+  if (!frame) return;
+  if (data?.reportHeight > 0) frame.style.height = `${Math.ceil(Number(data.reportHeight)) + 2}px`;
+  if (data?.reportPlace >= 0) scrollTo({ top: frame.getBoundingClientRect().top + scrollY + Number(data.reportPlace) - 80 });
+});
 new MutationObserver(() => {
   for (const frame of document.querySelectorAll("iframe[data-src]:not([data-seen])")) {
     frame.dataset.seen = "";

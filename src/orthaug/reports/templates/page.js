@@ -157,14 +157,14 @@
   /* Cells that hold numbers keep their width; what does not fit a narrow screen is scrolled. */
   const least = (place) => Math.max(0, ...figures[place.dataset.figure].data.map((t) => (t.texttemplate ? 130 + 28 * t.x.length : 0)));
   const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
-  const flown = (figure) => figure.data.some((trace) => trace.series || trace.minus);
+  const isSampled = (figure) => figure.data.some((trace) => trace.series || trace.minus);
 
   function draw(place) {
     const figure = figures[place.dataset.figure], from = style();
-    const now = place.layout && flown(figure) ? place.layout.xaxis.range : home(figure);
+    const now = place.layout && isSampled(figure) ? place.layout.xaxis.range : home(figure);
     const shown = layout(figure, from, widthOf(place));
     place.style.height = `${heightOf(figure, widthOf(place))}px`;
-    if (flown(figure)) shown.xaxis.range = [...now];
+    if (isSampled(figure)) shown.xaxis.range = [...now];
     const drawn = traces(figure, now);
     if (isNarrow(shown.width) && lettered(figure)) drawn.forEach((trace) => { trace.textfont = { size: 8 }; });
     return Plotly.react(place, coloured(drawn, from), shown, CONFIG);
@@ -173,7 +173,7 @@
   /* After a zoom the curves are drawn anew, as finely as they are now seen. */
   function refine(place) {
     const figure = figures[place.dataset.figure];
-    if (!flown(figure)) return;
+    if (!isSampled(figure)) return;
     const range = place.layout.xaxis.range.map(Number);
     const fresh = traces(figure, range), which = figure.data.map((t, i) => (t.series || t.minus ? i : -1)).filter((i) => i >= 0);
     const drawn = coloured(fresh, style()), each = (of) => which.map((i) => of(drawn[i]));
@@ -187,7 +187,7 @@
 
   function keys(place, event) {
     const figure = figures[place.dataset.figure];
-    if (event.target !== place || !flown(figure) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target !== place || !isSampled(figure) || event.ctrlKey || event.metaKey || event.altKey) return;
     const [low, high] = place.layout.xaxis.range.map(Number), width = high - low;
     const moves = {
       ArrowLeft: [low - width / 4, high - width / 4], ArrowRight: [low + width / 4, high + width / 4],
@@ -197,6 +197,16 @@
     if (!range) return;
     event.preventDefault();
     Plotly.relayout(place, { "xaxis.range": [...range] });
+  }
+
+  /* In a frame the page has no scrollbar of its own: it says how high it is, and which place a link leads to. */
+  function fillFrame() {
+    const send = (place) => parent.postMessage(place, "*");
+    new ResizeObserver(() => send({ reportHeight: document.documentElement.offsetHeight })).observe(document.documentElement);
+    document.querySelectorAll("a[href^='#']").forEach((link) => link.addEventListener("click", () => setTimeout(() => {
+      const target = document.getElementById(link.hash.slice(1));
+      if (target) send({ reportPlace: target.getBoundingClientRect().top + scrollY });
+    })));
   }
 
   const redraw = () => places.forEach(draw);
@@ -225,6 +235,7 @@
     addEventListener("hashchange", unfold);
     document.querySelectorAll("nav a").forEach((link) => link.addEventListener("click", () => setTimeout(unfold)));
     unfold();
+    if (parent !== window) fillFrame();
     dark.addEventListener("change", redraw);
     let waiting, width = innerWidth;
     addEventListener("resize", () => {
