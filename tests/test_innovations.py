@@ -239,6 +239,50 @@ def test_auto_takes_white_noise_where_there_is_no_process_noise() -> None:
     assert [one.model for one in moved.noise] == ["innovations"]
 
 
+def room(seed: int, lasting: float, rows: int = 450) -> oa.Record:
+    """A heated mass of 50 samples, its surroundings a first-order process of 120, white noise on the sensor."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([0.2, 0.5, 0.8, 1.0, 1.5], rows // 30 + 1), 30)[:rows]
+    x, ambient, y = 0.0, lasting * rng.normal(), np.zeros(rows)
+    for t in range(rows):
+        y[t] = x + 0.1 * rng.normal()
+        x += 0.02 * (10 * u[t] + ambient - x)
+        ambient = 0.9917 * ambient + lasting * np.sqrt(1 - 0.9917**2) * rng.normal()
+    return oa.Record.from_arrays(u, y, inputs=["u"], outputs=["y"], sampling_time=1.0)
+
+
+def fit_room(own: oa.Record, noise: str) -> Any:
+    heated = oa.Motion.from_equations(
+        [oa.State("x", "x + b*u - a*x", start="y")],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter("a", 0.05), oa.PhysicalParameter("b", 0.1)],
+        ["u"],
+        integrator="discrete",
+    )
+    return oa.estimate(own, heated, learner=None, noise=noise)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_predictor_whose_errors_grow_is_taken(seed: int) -> None:
+    """Under starts that are free, least squares prefers it: white noise on a slow system is the case."""
+    own = room(seed, 0.0)
+    plain = fit_room(own, "white")
+    for noise in ("innovations", "auto"):
+        fit = fit_room(own, noise)
+        # Where K is found beside zero, its errors fade
+        gain = 0.0 if not fit.model.coloured else float(fit.model.noise.gain[0, 0])
+        assert abs(1 - fit.values[0] - gain) < 1
+        np.testing.assert_allclose(fit.values, [0.02, 0.2], atol=4 * np.max(plain.std))
+        assert np.isfinite(fit.std).all()
+
+
+def test_a_short_record_cannot_tell_process_noise_from_what_lasts() -> None:
+    codes = {w.code for w in fit_room(room(1, 0.8), "innovations").warnings}
+    assert "short_for_noise" in codes
+    known = {w.code for w in fit_room(room(1, 0.8, rows=3000), "innovations").warnings}
+    assert "short_for_noise" not in known
+
+
 def test_held_inputs_and_integrators_have_it() -> None:
     own = record_of(simulate(5, rows=300))
     physics = oa.Motion.from_equations(

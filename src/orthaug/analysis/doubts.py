@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
-_NOISE_ONLY = ("unexplained", "predictor_unstable")  # warnings that leave intervals of noise alone
 _LISTED = 3  # parameters, and terms with memory
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
@@ -73,7 +72,7 @@ def doubt(made: E) -> E:
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test, hidden=hidden)
-    if any(warning.code in _NOISE_ONLY for warning in found["warnings"]):
+    if any(warning.code == "unexplained" for warning in found["warnings"]):
         found |= {
             name: _noise_only(getattr(result, name), withdrawn=left > _LEFT)
             for name in ("parameters", "physical_parameters")

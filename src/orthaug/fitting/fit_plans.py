@@ -27,7 +27,12 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.focus import choose_focus
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.independent_terms import independent_terms
-from orthaug.fitting.innovations import InnovationsTask, choose_noise, predicted_problem
+from orthaug.fitting.innovations import (
+    InnovationsTask,
+    choose_noise,
+    predicted_problem,
+    stable_or_white,
+)
 from orthaug.fitting.kinds import Solver
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import Task
@@ -377,9 +382,10 @@ class MotionPlan(FitPlan[MotionProblem]):
         if asked == "white":
             return None
         predicted = predicted_problem(self.problem, request.engine, warm=request.warm)
-        if asked == "innovations":
-            return fit(predicted, **request.options(noise="white"))
         options = request.options(noise="white", checkpoints=None)
+        if asked == "innovations":
+            coloured = fit(predicted, **request.options(noise="white"))
+            return stable_or_white(coloured, lambda: fit(self.problem, **options))
         return choose_noise(fit(self.problem, **options), fit(predicted, **options))
 
     def settled(self) -> Criterion:

@@ -5,6 +5,11 @@ free run is trained by serves: K is among the parameters, the states that segmen
 eliminated. The search begins at the free run's parameters, with K = 0 or that of a Kalman filter
 (`scipy.linalg.solve_discrete_are`) for the best of several sizes of process noise.
 
+A predictor whose errors grow, and the one that is its mirror image about the unit circle, predict
+alike but for the size of the innovations, which is smaller where errors grow: under starts that are
+free, least squares would prefer it. The search goes on from the mirror image; where that ends at an
+unstable predictor too, white noise on the outputs is taken.
+
 K is a nuisance. With a = (c, w) and the information G of (c, K, w), `dK = −G_kk⁻¹ G_ka da` where K
 follows a, so that E = d(c, K, w)/da gives the information `EᵀGE` of a alone, its middle `EᵀΩE`, and
 its scores `Eᵀs`. What follows, the split above all, is as for a free run.
@@ -12,6 +17,7 @@ its scores `Eᵀs`. What follows, the split above all, is as for a free run.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,6 +28,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jnp
+from orthaug._base.lines import plain_number
 from orthaug._base.progress import LOG, RunProgress
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
@@ -48,6 +55,10 @@ from orthaug.physics.problem import MotionProblem
 
 _PROCESS = (1e-6, 1e-4, 1e-2, 1.0)  # variance of a state in a sample, of its own, to begin with
 _POINTS = 64  # at which the motion is linearised
+_LONG = (
+    30  # time constants, from which on a record tells white process noise from slow disturbances
+)
+_INTEGRATES = 1 - 1e-6  # magnitude of a pole that has no time constant
 
 
 def predicted_problem(problem: MotionProblem, engine: Engine, *, warm: bool) -> MotionProblem:
@@ -116,6 +127,13 @@ class InnovationsTask(MotionTask):
         found = descend_from(own.from_states(np.asarray(states)), solver, starts, None, progress)
         if found is None:
             return plan, None
+        mirrored = mirrored_gain(own, found)
+        if mirrored is not None:
+            again = np.concatenate([found.end.point.theta[: len(q)], mirrored.ravel()])
+            stable = descend_from(
+                own.from_states(np.asarray(found.end.point.states)), solver, [again], None, progress
+            )
+            found = found if stable is None else stable
         point = found.end.point
         states = np.asarray(point.states)
         x, _ = own.trajectory(point.theta, (), states)
@@ -140,7 +158,7 @@ class InnovationsTask(MotionTask):
         fit = replace(fit, warnings=(*fit.warnings, *restart_warnings(self.physics)))
         if briefly or not learned.ending.usable or learned.coefficients is None:
             return fit
-        doubts = check_predictor(plan, learned.coefficients, learned.weights, fit.states)
+        doubts = check_length(plan, learned.coefficients, learned.weights, fit.states)
         return replace(fit, warnings=(*fit.warnings, *doubts))
 
     def _with_gain(self, learned: TrainedLearner) -> tuple[SegmentedMotion, TrainedLearner]:
@@ -257,15 +275,16 @@ def _of_gain(plan: SegmentedMotion, learned: TrainedLearner, own: int, count: in
 def choose_noise(white: MotionEstimate, coloured: MotionEstimate) -> MotionEstimate:
     """Return the fit of the lower BIC, of white noise on the outputs and of innovations.
 
-    White noise is the case K = 0, which the result then says.
+    White noise is the case K = 0, which the result then says. It is taken, too, where the predictor
+    is unstable.
     """
-    gain = np.zeros((coloured.model.form.states, len(coloured.model.outputs)))
-    scores = [_bic(white, 0), _bic(coloured, gain.size)]
+    gains = coloured.model.form.states * len(coloured.model.outputs)
+    scores = [_bic(white, 0), _bic(coloured, gains)]
     seconds = white.status.seconds + coloured.status.seconds
     LOG.info("noise: BIC %.6g of white noise, %.6g of innovations", *scores)
     best = coloured
-    if not scores[1] < scores[0]:
-        best = replace(white, model=replace(white.model, noise=InnovationsModel(gain)))
+    if is_unstable(coloured) or not scores[1] < scores[0]:
+        best = _without_gain(white, coloured)
     return replace(best, status=replace(best.status, seconds=seconds))
 
 
@@ -277,20 +296,115 @@ def _bic(fit: MotionEstimate, gains: int) -> float:
     return rows * np.linalg.slogdet(noise)[1] + (gains + fit.effective_weights) * np.log(rows)
 
 
-def check_predictor(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> list[Warning]:
-    """Return a warning where errors of the predictor's states grow from sample to sample."""
+def mirrored_gain(plan: SegmentedMotion, found: FreeRunFit) -> Matrix | None:
+    """Return the gain of the stable predictor that explains the outputs as an unstable one does.
+
+    With K and Σ of the unstable one, state and outputs are disturbed by Ke and e of covariance Σ;
+    the stabilising solution of that Riccati equation gives the other K (Anderson and Moore 1979,
+    ch. 9). None where the predictor is stable, or nothing follows.
+    """
+    point = found.end.point
+    c, states = np.asarray(point.theta), np.asarray(point.states)
+    slopes = _slopes(plan, c, (), states)
+    if not _growth(slopes) >= 1:
+        return None
+    squares = found.objective.squares(point)
+    if slopes is None or squares is None:
+        return None
+    nx, ny = plan.dynamics.states, len(plan.dynamics.outputs)
+    error, out = (np.mean(slopes, axis=0)[rows] for rows in (np.s_[:nx], np.s_[nx:]))
+    gain = c[-nx * ny :].reshape(nx, ny)
+    noise = np.asarray(squares) / max(plan.segments.count, 1)
+    try:
+        own = error + gain @ out
+        p = scipy.linalg.solve_discrete_are(
+            own.T, out.T, gain @ noise @ gain.T, noise, s=gain @ noise
+        )
+        stable = (own @ p @ out.T + gain @ noise) @ np.linalg.inv(out @ p @ out.T + noise)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return stable if np.isfinite(stable).all() else None
+
+
+def _slopes(
+    plan: SegmentedMotion, c: Vector, w: Any, states: Any
+) -> Float[np.ndarray, "r n x"] | None:
+    """Return the slopes of steps of the predictor by its states, at some points that are finite."""
     local, _ = linearise(plan, c, w, states)
     if local is None:
-        return []
-    slopes = np.moveaxis(np.asarray(local.to_state)[: plan.dynamics.states], -1, 0)
+        return None
+    slopes = np.moveaxis(np.asarray(local.to_state), -1, 0)
     slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
-    radius = float(np.median(np.abs(np.linalg.eigvals(slopes)).max(axis=1)))
-    if radius < 1:
-        return []
+    return slopes if len(slopes) else None
+
+
+def _growth(slopes: Float[np.ndarray, "r n x"] | None) -> float:
+    """Return the factor by which errors of the states grow in a sample; NaN of no slopes."""
+    if slopes is None:
+        return np.nan
+    errors = slopes[:, : slopes.shape[2]]
+    return float(np.median(np.abs(np.linalg.eigvals(errors)).max(axis=1)))
+
+
+def is_unstable(fit: MotionEstimate) -> bool:
+    """Return whether errors of the states of a fit's predictor grow from sample to sample."""
+    numbers = fit.model.numbers
+    return _growth(_slopes(fit.segmented, numbers.c, numbers.weights, fit.states)) >= 1
+
+
+def stable_or_white(
+    coloured: MotionEstimate, white: Callable[[], MotionEstimate]
+) -> MotionEstimate:
+    """Return a fit with innovations, or that of white noise where its predictor is unstable.
+
+    White noise is then said to be K = 0, with a warning.
+    """
+    if not is_unstable(coloured):
+        return coloured
+    fit = _without_gain(white(), coloured)
     text = (
-        "the predictor is not stable: an error of its states grows by a factor of "
-        f"{1 + float(f'{radius - 1:.1g}'):.9g} a sample. Its predictions depend on where they "
-        "start, and its intervals cover no more than the noise that it describes. Physics may be "
-        "missing: compare with a fit without [noise]."
+        "with `noise.model` = innovations no stable predictor was found: errors of its states "
+        "would grow from sample to sample. This fit has white noise on the outputs instead, which "
+        "is K = 0. If its errors are coloured, physics is missing, or the noise is of a kind that "
+        "K does not describe."
     )
-    return [Warning("predictor_unstable", text)]
+    return replace(fit, warnings=(*fit.warnings, Warning("white_noise_taken", text)))
+
+
+def _without_gain(white: MotionEstimate, coloured: MotionEstimate) -> MotionEstimate:
+    """Return a fit of white noise that says that K is 0."""
+    gain = np.zeros((coloured.model.form.states, len(coloured.model.outputs)))
+    return replace(white, model=replace(white.model, noise=InnovationsModel(gain)))
+
+
+def check_length(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> list[Warning]:
+    """Return a warning where the record is too short to tell what kind the process noise is.
+
+    K describes process noise that is independent from sample to sample. Of a disturbance that lasts
+    (ambient temperature, a supply, wind) the innovations look as white in a short record, and θ is
+    further off than its intervals say: in 14 records of 9 time constants by 1.9 standard errors,
+    root mean square, in 10 of 30 time constants by 1.5 but for one.
+    """
+    noise, slopes = plan.predictor, _slopes(plan, c, w, states)
+    if noise is None or noise.covariance is None or slopes is None:
+        return []
+    std = np.sqrt(np.maximum(np.diag(noise.covariance), 0.0))
+    if not (np.abs(noise.gain.ravel()) > 2 * std).any():
+        return []
+    nx = plan.dynamics.states
+    own = slopes[:, :nx] + noise.gain @ slopes[:, nx:]
+    decay = np.abs(np.linalg.eigvals(own))
+    slowest = float(np.median(np.where(decay < _INTEGRATES, decay, 0.0).max(axis=1)))
+    samples = -1 / np.log(slowest) if slowest > 0 else 0.0
+    rows = plan.segments.count
+    if rows >= _LONG * samples:
+        return []
+    seconds = plain_number(samples * plan.problem.record.sampling_time)
+    text = (
+        f"the record is {plain_number(rows / samples)} time constants long (the slowest is "
+        f"{seconds} s): too short to tell process noise from a disturbance that lasts. The 95 % "
+        "intervals count process noise that is independent from sample to sample. Where a "
+        "disturbance lasts (ambient temperature, a supply, wind), parameters may be off by "
+        "several standard errors more. Measure it as an input, or fit a second record and compare."
+    )
+    return [Warning("short_for_noise", text)]
