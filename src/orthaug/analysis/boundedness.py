@@ -75,7 +75,9 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
             "small_margin" if factor is not None else "",
         )
     stays, times = (
-        ("remains bounded", searched) if factor is None else ("grows without bound", factor)
+        ("remains bounded", searched)
+        if factor is None
+        else ("exceeds the training outputs a million times", factor)
     )
     text = (
         f"The free run {stays} with the inputs' deviations from their means {times:.4g} times "

@@ -20,7 +20,7 @@ from orthaug.data.record import Record
 
 _LEVEL = 0.001  # of the test, divided by the number of inputs
 _SHARE = 0.02  # of what its own past leaves of an input: the share by outputs counts from there on
-_SURE = 4.0  # standard errors over blocks by which it is significant
+_SURE = 3.0  # standard errors over blocks by which it is significant
 _INPUT_LAGS, _OUTPUT_LAGS = 40, 4
 _BESIDE = 10  # lags of the other inputs
 _LEVELS = 6  # of an input that is held: those before the last change that count as its past
@@ -101,10 +101,27 @@ def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
     )
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
-        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: the data "
-        f"were probably recorded under feedback. {_REMEDIES[method]}"
+        f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: "
+        f"{_source(found, record)} {_REMEDIES[method]}"
     )
     return (Warning("closed_loop", text),)
+
+
+def _source(found: tuple[Feedback, ...], record: Record) -> str:
+    """Return a sentence on where feedback comes from.
+
+    Of several inputs, one that follows the outputs may be another quantity of the plant: a motor's
+    speed follows its current.
+    """
+    names = " and ".join(one.name for one in found)
+    if len(found) == len(record.inputs):
+        return "the data were probably recorded under feedback."
+    moved = "it" if len(found) == 1 else "them"
+    return (
+        f"a controller sets {names}, or the plant itself moves {moved} (as "
+        "a motor's current moves its speed). If it is the plant, there is no reference to "
+        "record: make it an output with an equation of its own."
+    )
 
 
 def _input_share(record: Record, j: int) -> tuple[float, float] | None:

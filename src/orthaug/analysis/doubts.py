@@ -66,7 +66,7 @@ def doubt(made: E) -> E:
                 text=_unexplained_text(test, left, fit, result) + _withdrawal(result, left),
             )
         )
-    hidden = test is not None and test.has_memory and left <= _LEFT
+    hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
@@ -166,10 +166,16 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
             "own past predicts"
         )
+    remedy = (
+        "Search for its terms with `[[suspects]]` or `orthaug explain`. Write them into the "
+        "physics, or let the learner see what they depend on."
+        if fit.learns
+        else "Fit with a learner that sees what the missing terms may depend on; `orthaug explain` "
+        "then names them."
+    )
     return (
         f"{what}. The 95 % intervals count noise only; missing physics may have moved the "
-        "parameters by more. Search for its terms with `[[suspects]]` or `orthaug explain`. "
-        "Write them into the physics, or let the learner see what they depend on."
+        f"parameters by more. {remedy}"
     )
 
 
@@ -188,8 +194,8 @@ def _functions_text(left: float) -> str:
 
 
 def _hidden_state(fit: Any, test: StructureTest) -> str:
-    assert test.memory is not None
-    best = test.memory
+    assert test.state is not None
+    best = test.state
     others = [
         one.name
         for one in test.families

@@ -45,6 +45,8 @@ _MOST_USED = 0.9  # of the rows, by columns
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
+_MUCH = 1.5  # times what functions of one row predict, with which memory is the cause beside them
+_NEARLY = 0.8  # of the best family's share
 # Error of the run over the outputs' deviation, from which on the run's states are not the system's
 _FAR = 0.5
 # Steps, shorter ones, and the fall of the squares that ends them
@@ -115,9 +117,25 @@ class StructureTest:
         """True if there is any structure."""
         return self.static is not None or self.memory is not None
 
+    delayed: tuple[str, ...] = ()
+    """Signals whose short memory is a lag or a delay that is missing, and no state."""
+
     def is_a_lag(self, one: FamilyTest) -> bool:
         """Return whether a family forgets within a few samples, as a further lag does."""
-        return one.is_short(_LEAST_LAG * self.step)
+        return one.on in self.delayed and one.is_short(_LEAST_LAG * self.step)
+
+    @property
+    def state(self) -> FamilyTest | None:
+        """The family with memory that tells of a state; None where what it tells of is a lag.
+
+        Where an input seems to act a sample or two late and memory of a state predicts nearly as
+        much, it is the state.
+        """
+        if self.memory is None or not self.is_a_lag(self.memory):
+            return self.memory
+        near = _NEARLY * self.memory.share
+        others = (one for one in self.families if one.on not in self.delayed and one.sure)
+        return next((one for one in others if one.share >= near), None)
 
     @property
     def has_memory(self) -> bool:
@@ -130,11 +148,16 @@ class StructureTest:
         few of. A run far from the data has other states than the system: a function of these would
         pass for memory.
         """
-        if self.hidden is None or self.memory is None or self.is_far:
+        if self.hidden is None or self.state is None or self.is_far:
             return False
-        if self.is_a_lag(self.hidden) or self.is_a_lag(self.memory):
+        if self.state is self.memory and self.is_a_lag(self.hidden):
             return False
-        return self.static is None or self.memory.share >= self.static.share + _CLEARLY
+        return self.static is None or self.state.share >= self.static.share + _CLEARLY
+
+    def exceeds(self, share: float) -> bool:
+        """Return whether memory predicts much more than functions of one row, and than a share."""
+        static = 0.0 if self.static is None else self.static.share
+        return self.state is not None and self.state.share > _MUCH * max(static, share)
 
 
 @dataclass(frozen=True)
@@ -161,7 +184,10 @@ def structure_test(model: Model, record: Record) -> StructureTest | None:
         return None
     moved = theta - np.asarray(model.numbers.theta)
     found = _test_families(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
-    return None if found is None else replace(found, step=float(model.sampling_time), off=off)
+    if found is None:
+        return None
+    delayed = tuple(_equations(model).delayed(runs[0]))
+    return replace(found, step=float(model.sampling_time), off=off, delayed=delayed)
 
 
 def _fit_physics(
@@ -267,6 +293,10 @@ class _OfOutputs:
                 found[f"{lags[0]} - {lags[1]}"] = first - others[0]
         return found
 
+    def delayed(self, run: LinearRun) -> list[str]:
+        """Return the signals of which the physics may read too few lags: all."""
+        return list(self.signals(run))
+
     @property
     def doubted(self) -> tuple[tuple[int, str], ...]:
         """Place and name of the equations that may lack a term."""
@@ -302,6 +332,10 @@ class _OfStates:
         found = dict(zip(names, np.concatenate([run.states, run.rows], axis=1).T, strict=True))
         seen = zip(form.features, form.features_at(run.states, run.rows).T, strict=False)
         return found | {str(entry): row for entry, row in seen if str(entry) not in found}
+
+    def delayed(self, run: LinearRun) -> list[str]:
+        """Return the signals that may act late: inputs. States have no lags."""
+        return list(self.form.motion.inputs)
 
     @property
     def doubted(self) -> tuple[tuple[int, str], ...]:

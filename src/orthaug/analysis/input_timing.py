@@ -25,6 +25,7 @@ ROWS = 4000  # at most
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
+_ALIKE = 0.25  # of what the better gains: by less a lag and a delay are not told apart
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -213,21 +214,44 @@ class LateInput:
         )
 
     @property
+    def alike(self) -> bool:
+        """True if the data hardly tell a lag from a delay."""
+        gained = self.declared - min(self.lagged, self.delayed)
+        return abs(self.lagged - self.delayed) < _ALIKE * gained
+
+    @property
+    def manner(self) -> str:
+        """How the input acts, in words."""
+        by_lag = self.by_lag and not self.alike
+        return "through a lag" if by_lag else "later than in the equations"
+
+    @property
     def warning(self) -> Warning:
         """With what to write into the spec."""
-        if self.by_lag:
-            return Warning(
-                "slow_input",
-                f"{self.input} seems to act through a lag: {self.gain}, with other parameters. A "
-                "drive, a filter or a sensor may be slow. Give it a state of its own: its "
-                "derivative is (what goes in − the state)/T, with T as a parameter.",
+        slow = (
+            "give it a state of its own: its derivative is (what goes in − the state)/T, with T as "
+            "a parameter."
+        )
+        late = (
+            'delay the input by [[data.prepare]] with step = "shift", channel = '
+            f'"{self.input}", samples = {self.delay}.'
+        )
+        code = "slow_input" if self.by_lag else "dead_time"
+        if self.alike:
+            remedy = (
+                "The two are too close to tell a lag from a delay. If a drive, a filter or a "
+                f"sensor is slow, {slow} If there is a dead time, {late}"
+            )
+        elif self.by_lag:
+            remedy = f"A drive, a filter or a sensor may be slow: {slow}"
+        else:
+            remedy = (
+                f"If there is a dead time, {late} If a drive or a sensor is slow, model it in the "
+                "equations."
             )
         return Warning(
-            "dead_time",
-            f"{self.input} seems to act late: {self.gain}, with other parameters. If there is "
-            'a dead time, delay the input by [[data.prepare]] with step = "shift", channel = '
-            f'"{self.input}", samples = {self.delay}. If a drive or a sensor is slow, model it '
-            "in the equations.",
+            code,
+            f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters. {remedy}",
         )
 
 

@@ -21,6 +21,7 @@ from orthaug.fitting.motion_task import (
     descend_from,
     draw_starts,
     is_cheap,
+    substep_shift,
 )
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
@@ -28,6 +29,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 
 _AS_GOOD = 1e-3  # of the residual: as good
 _BETTER = 0.02  # of the residual: clearly better
+_INTEGRATED = 0.1  # of the residual: how far half the step may move the outputs of another solution
 _APART = 10.0  # standard errors by the curvature of the fit: another minimum, not a flat one
 
 
@@ -96,7 +98,7 @@ def find_other_solution(
                 continue
             if not np.isfinite(coordinates.physical(other.end.point.theta)).all():
                 continue
-            if _is_another(own, base, other.end.point.theta):
+            if _is_another(own, base, other.end.point.theta) and _is_of_the_equations(own, other):
                 found.append((residual, other))
     if not found:
         return None
@@ -104,6 +106,18 @@ def find_other_solution(
     p = coordinates.physical(best.end.point.theta)
     names = segmented.problem.motion.names
     return OtherSolution(dict(zip(names, map(float, p), strict=True)), residual, fitted)
+
+
+def _is_of_the_equations(own: SegmentedMotion, other: FreeRunFit) -> bool:
+    """Return whether a solution is one of the equations, not of an integrator whose steps are long.
+
+    A mode far faster than a step decays by another factor than in the equations, which another
+    parameter can make the right one.
+    """
+    if own.problem.motion.scheme.discrete:
+        return True
+    finer = own.with_substeps(2 * own.dynamics.substeps)
+    return substep_shift(own, finer, other) < _INTEGRATED
 
 
 def _is_another(own: SegmentedMotion, base: FreeRunFit, q: Vector) -> bool:

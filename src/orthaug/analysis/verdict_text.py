@@ -20,6 +20,7 @@ from orthaug.models.response import Response
 
 SHARE = 0.01  # of the residual's variance: what a regressor explains of it counts from there
 _SLOW = 0.9  # of a free run's variance: a share by its own past from there on is a drift
+_MOST_OF_IT = 0.5  # of the errors' mean square, from which on a term is likely what is missing
 _LISTED = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
@@ -424,9 +425,7 @@ def free_run_words(
     if late:
         return (
             f"{subject} ({sizes}) contains more than noise. Most likely "
-            f"{late[0].input} acts "
-            f"{'through a lag' if late[0].by_lag else 'later than in the equations'}: "
-            f"{late[0].gain}."
+            f"{late[0].input} acts {late[0].manner}: {late[0].gain}."
         )
     if lacks is not None:
         return f"{subject} ({sizes}) contains more than noise. {_name_terms(lacks)}"
@@ -486,7 +485,11 @@ def _name_terms(lacks: MissingTest) -> str:
             f"no single one does: a force of another form is missing, most likely in the equation "
             f"of {equations}."
         )
-    text = f"Most likely {best} would explain {percent(best.share)} of its mean square"
+    text = f"{best} would explain {percent(best.share)} of its mean square"
+    if best.share < _MOST_OF_IT:
+        text = f"No simple term explains half of it. The nearest: {text}"
+    else:
+        text = f"Most likely {text}"
     if others:
         text += (
             ", as would "

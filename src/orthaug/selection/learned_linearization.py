@@ -104,7 +104,10 @@ def linearization_of(model: Model, record: Record) -> LearnedLinearization:
         InputError: a model without a learner, other channels, too few rows, or none with a value.
     """
     if not model.learns:
-        raise InputError("the model is physics alone: it has no learner that could be explained.")
+        raise InputError(
+            "the model is physics alone: it has no learner that could be explained. Fit it "
+            "with a learner that sees what the missing terms may depend on."
+        )
     linearization = _OF_FORM[type(model.form)](model, record)
     if len(linearization.target) < FEWEST:
         raise InputError(
