@@ -149,6 +149,8 @@ class MissingTermResult(Content):
     coefficient: Number
     share: Number
     expression: str
+    variables: list[str] = []
+    """The states and inputs that it depends on."""
 
 
 class MissingResult(Content):

@@ -249,10 +249,8 @@ class LateInput:
                 f"If there is a dead time, {late} If a drive or a sensor is slow, model it in the "
                 "equations."
             )
-        return Warning(
-            code,
-            f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters. {remedy}",
-        )
+        found = f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters."
+        return Warning(code, f"{found} {remedy}")
 
 
 def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:

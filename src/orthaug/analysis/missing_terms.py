@@ -13,6 +13,7 @@ does not pass for colour.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -194,6 +195,8 @@ _PROBED = 20  # points at which an equation is looked at
 _MOVED = 1e-3  # of a parameter, to see whether an equation has it
 _ALONE = 0.05  # of the errors' variance: what a single term explains below it is small
 _TOGETHER_LEVEL, _TOGETHER = 1e-6, 0.2  # of the joint test, and of the errors' variance
+_MOST_FACTORS = 5  # states and inputs, of which products are tried
+_ROWS_PER_PRODUCT = 10
 _RIVAL = 0.9  # of the best term's share, with which another one is named beside it
 
 
@@ -213,6 +216,13 @@ class MissingTerm:
     share: float
     one_sided: bool = False
     """True if the variable keeps its sign over the data: nothing is then known of odd and even."""
+    factors: tuple[str, ...] = ()
+    """Of a product, its variables; `variable` is then the product itself, linear in it the term."""
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """States and inputs that the term depends on."""
+        return self.factors or (() if self.variable is None else (self.variable,))
 
     @property
     def expression(self) -> str:
@@ -280,14 +290,20 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
     A difference that the equations contain, such as the stroke of a spring between two masses, is
-    a variable, too. None where the runs have no slopes, or there are too few rows.
+    a variable, too. Products of two states or inputs are tried where rows are many. None where the
+    runs have no slopes, or there are too few rows.
     """
     motion = fit.problem.motion
     if not fit.segmented.dynamics.differentiable:
         return None
     names, choice = _variables(motion)
     equations = doubted_equations(fit)
+    rows = fit.segmented.segments.count * len(motion.outputs)
+    products = _products(motion.visible)
     count = 1 + len(SHAPES) * len(names)
+    if rows < _ROWS_PER_PRODUCT * (count + len(products)) * len(equations):
+        products = []
+    count += len(products)
     found_of: list[tuple[Vector, list[bool]]] = []
 
     def terms(points: Matrix) -> Terms:
@@ -295,7 +311,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         size = np.abs(own).max(axis=1, initial=0.0)
         size = np.where(size > 0, size, 1.0)
         found_of.append((size, [not changes_sign(values) for values in own]))
-        return lambda rows: _values(choice @ rows / size[:, None], found_of[0][1])
+        return lambda rows: _values(choice @ rows / size[:, None], found_of[0][1], products)
 
     found = sensitivities(fit, equations, terms, count)
     if found is None:
@@ -305,7 +321,8 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         return None
     p, freedom, share, gains, shares, coefficients = tested
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
-    listed = [_term(motion, equations, names, j, coefficients, shares, *found_of[0]) for j in order]
+    made = (motion, equations, names, products)
+    listed = [_term(*made, j, coefficients, shares, *found_of[0]) for j in order]
     return MissingTest(p, freedom, share, tuple(listed))
 
 
@@ -321,6 +338,18 @@ def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
     rows = [unit[every.index(name)] for name in names]
     rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
     return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
+
+
+Product = tuple[int, int, int, int]
+"""Two variables and their powers."""
+
+
+def _products(names: tuple[str, ...]) -> list[Product]:
+    """Return the products of two variables, each linear or one squared; none of many variables."""
+    if len(names) > _MOST_FACTORS:
+        return []
+    pairs = itertools.combinations(range(len(names)), 2)
+    return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
 
 
 def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:
@@ -345,8 +374,8 @@ def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:
     return tuple(sorted(moved)) or tuple(range(len(motion.states)))
 
 
-def _values(z: Matrix, one_sided: list[bool]) -> Any:
-    """Return a constant, then the shapes of each variable: (1 + 5 n, r) of z (n, r).
+def _values(z: Matrix, one_sided: list[bool], products: list[Product]) -> Any:
+    """Return a constant, the shapes of each variable, products: (1 + 5 n + m, r) of z (n, r).
 
     Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
     their places.
@@ -355,24 +384,37 @@ def _values(z: Matrix, one_sided: list[bool]) -> Any:
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
         for one, both in zip(z, np.logical_not(one_sided), strict=True)
     ]
-    return np.stack([np.ones(z.shape[1]), *(values for own in shaped for values in own)])
+    multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in products]
+    each = (values for own in shaped for values in own)
+    return np.stack([np.ones(z.shape[1]), *each, *multiplied])
 
 
 def _term(
     motion: Motion,
     equations: tuple[int, ...],
     names: tuple[str, ...],
+    products: list[Product],
     j: int,
     coefficients: Vector,
     shares: Vector,
     sizes: Vector,
     one_sided: list[bool],
 ) -> MissingTerm:
-    count = 1 + len(SHAPES) * len(names)
+    simple = 1 + len(SHAPES) * len(names)
+    count = simple + len(products)
     equation, number = motion.names_of_states[equations[j // count]], j % count
     coefficient, share = float(coefficients[j]), float(shares[j])
     if number == 0:
         return MissingTerm(equation, None, "constant", coefficient, share)
+    if number >= simple:
+        first, second, a, b = products[number - simple]
+        coefficient /= float(sizes[first] ** a * sizes[second] ** b)
+        factors = (names[first], names[second])
+        product = "*".join(
+            name if power == 1 else f"{name}**{power}"
+            for name, power in zip(factors, (a, b), strict=True)
+        )
+        return MissingTerm(equation, product, "linear", coefficient, share, factors=factors)
     variable, shape = divmod(number - 1, len(SHAPES))
     power = (1, 0, 1, 2, 3)[shape]
     coefficient /= float(sizes[variable]) ** power

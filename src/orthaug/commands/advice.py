@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.lines import plural
+from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
@@ -223,17 +223,20 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
     if job.spec.declared_learner() is None:
         change = {
             f"motion.states.{best.equation}.learned": True,
-            "learner": {"inputs": [best.variable]},
+            "learner": {"inputs": list(best.variables)},
         }
-        words = f"a learner that sees {best.variable} in the equation of {best.equation}"
+        seen = join_words(best.variables)
+        words = f"a learner that sees {seen} in the equation of {best.equation}"
         yield Proposal(words, change, learns=True)
         return
     now = job.spec.learner_inputs()
     learned = {job.problem.motion.names_of_states[i] for i in job.problem.motion.learned[0]}
-    if not fit.learns or now is None or best.equation not in learned or _reads(now, best.variable):
+    if not fit.learns or now is None or best.equation not in learned:
         return
-    change = {"learner.inputs": [*now, best.variable]}
-    yield Proposal(f"a learner that also sees {best.variable}", change, learns=True)
+    new = [name for name in best.variables if not _reads(now, name)]
+    if new:
+        change = {"learner.inputs": [*now, *new]}
+        yield Proposal(f"a learner that also sees {join_words(new)}", change, learns=True)
 
 
 def _reads(inputs: tuple[str, ...], variable: str) -> bool:
