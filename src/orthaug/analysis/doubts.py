@@ -20,12 +20,13 @@ from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResul
 from orthaug.analysis.fit_findings import Findings, ParameterResult
 
 if TYPE_CHECKING:
-    from orthaug.analysis.hidden_state import FamilyTest, StructureTest
+    from orthaug.analysis.hidden_state import FamilyTest, ParameterDrift, StructureTest
 
 E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
+_NOISE_ONLY = ("unexplained", "parameter_drift")  # warnings that leave intervals of noise alone
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
 _LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
@@ -69,10 +70,12 @@ def doubt(made: E) -> E:
     hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
+    if test is not None and test.drift is not None and not hidden:
+        warnings += _drifting(fit, test.drift)
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test, hidden=hidden)
-    if any(warning.code == "unexplained" for warning in found["warnings"]):
+    if any(warning.code in _NOISE_ONLY for warning in found["warnings"]):
         found |= {
             name: _noise_only(getattr(result, name), withdrawn=left > _LEFT)
             for name in ("parameters", "physical_parameters")
@@ -210,6 +213,26 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
         f"the free run's error on held-out rows{beside}. No function of the model's own states "
         f"predicts it.{_movement_text(fit, best)} Remedy: {remedy}."
     )
+
+
+def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
+    """Return a warning of a parameter that changes over the record; none where it hardly does."""
+    name, now = fit.problem.names[drift.place], np.asarray(fit.theta, dtype=float)
+    place = np.arange(len(now)) == drift.place
+    ends = [
+        float(fit.problem.values_at(now + np.where(place, moved, 0.0))[drift.place])
+        for moved in (drift.begin, drift.end)
+    ]
+    if not np.isfinite(ends).all():
+        return []
+    text = (
+        f"{name} seems to change over the record: from {ends[0]:.3g} at its begin to {ends[1]:.3g} "
+        f"at its end, which explains {percent(drift.share)} of the free run's error on held-out "
+        "rows. Its value is a mean, and its interval is that of a constant. Record what it depends "
+        "on, such as a temperature, and write that into the physics; or fit the begin and the end "
+        "on their own."
+    )
+    return [Warning("parameter_drift", text)]
 
 
 def _movement_text(fit: Any, best: FamilyTest) -> str:

@@ -18,14 +18,20 @@ from typing import Any
 
 import numpy as np
 import scipy.special
-from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.filtered_rows import (
+    error_colours,
+    error_scale,
+    filter_rows,
+    least_squares,
+    span,
+    stacked_rows,
+)
 from orthaug.analysis.memory import KINDS, MemoryTerm, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.record import Record
-from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
@@ -38,10 +44,8 @@ _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding an
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 # Quantiles about which a function of a learner's feature bends
 _CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
-_STATIC = 5
+_STATIC, _DRIFT = 5, "drift"
 _MULTIPLIED = 8  # features, of which products of pairs are taken
-_FILLINGS, _SEED = 3, 20261125  # of what the columns explain with noise, and their key
-_MOST_USED = 0.9  # of the rows, by columns
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 # Of the filtered errors' square, by which memory predicts more than functions of one row
 _CLEARLY = 0.1
@@ -89,6 +93,21 @@ class FamilyTest:
 
 
 @dataclass(frozen=True)
+class ParameterDrift:
+    """A parameter, by its place, that seems to change over the record.
+
+    `share` of the errors is what a curve of the second degree over time predicts; `begin` and
+    `end` are by how much its value there differs from the model's, in the coordinate that is
+    estimated.
+    """
+
+    place: int
+    share: float
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
 class StructureTest:
     """Structure beside noise in the errors of a free run.
 
@@ -117,6 +136,8 @@ class StructureTest:
         """True if there is any structure."""
         return self.static is not None or self.memory is not None
 
+    drift: ParameterDrift | None = None
+    """The parameter that changes over the record, if that predicts more than any term."""
     delayed: tuple[str, ...] = ()
     """Signals whose short memory is a lag or a delay that is missing, and no state."""
 
@@ -203,19 +224,19 @@ def _fit_physics(
     theta = np.asarray(model.numbers.theta, dtype=float)
     for _ in range(_SETTLING):
         base = _base_columns(model, runs)
-        pieces, colours = _colour_rows(runs, base)
-        rows, nt = np.concatenate([_filter_piece(piece, colours) for piece in pieces]), len(theta)
+        pieces, colours = error_colours(runs, base)
+        rows, nt = np.concatenate([filter_rows(piece, colours) for piece in pieces]), len(theta)
         step, before = (
             _step_beside(rows[:, :nt], rows[:, nt:-1], rows[:, -1]),
             _residual_sum(rows[:, nt:-1], rows[:, -1]),
         )
-        scale, trial, after = _scale(runs), None, np.inf
+        scale, trial, after = error_scale(runs), None, np.inf
         for _ in range(_HALVINGS):
             trial, after = linear_runs(model, record, _MOST_ROWS, theta + step), np.inf
             if trial is not None:
                 beside = [one[..., nt:] for one in _base_columns(model, trial)]
                 moved = np.concatenate(
-                    [_filter_piece(piece, colours) for piece in _pieces(trial, beside, scale)]
+                    [filter_rows(piece, colours) for piece in stacked_rows(trial, beside, scale)]
                 )
                 after = _residual_sum(moved[:, :-1], moved[:, -1])
             if after < before:
@@ -229,12 +250,6 @@ def _fit_physics(
     return theta, runs
 
 
-def _least_squares(columns: Matrix, target: Vector) -> Vector:
-    size = np.linalg.norm(columns, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
-
-
 def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
     """Return the coefficients of columns beside others, 0 along what the others replace.
 
@@ -243,7 +258,7 @@ def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
     """
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1.0)
-    q = _range(others)
+    q = span(others)
     rest = columns / size
     rest = rest - q @ (q.T @ rest)
     left, values, right = np.linalg.svd(rest, full_matrices=False)
@@ -253,7 +268,7 @@ def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
 
 def _residual_sum(columns: Matrix, target: Vector) -> float:
     """Return the sum of squares that columns leave."""
-    q = _range(columns)
+    q = span(columns)
     rest = target - q @ (q.T @ target)
     return float(rest @ rest)
 
@@ -473,47 +488,15 @@ def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[_Family], 
                     term.along(own[name], step) / size for term in terms
                 ]
                 found.append(_respond(model, run, place, np.stack(values, axis=1)))
+    # How the outputs follow a parameter that changes slowly, against what they remember
+    rows = sum(len(run.error) for run in runs)
+    over_time = np.split(np.linspace(-1, 1, rows), np.cumsum([len(run.error) for run in runs])[:-1])
+    for i in range(len(model.numbers.theta)):
+        families.append(_Family("", str(i), _DRIFT, (None, None)))
+        for found, run, t in zip(columns, runs, over_time, strict=True):
+            moved = run.parameters()[..., i]
+            found.append(np.stack([moved * power[:, None] for power in (t, t**2)], axis=2))
     return families, [np.concatenate(found, axis=2) for found in columns]
-
-
-def _scale(runs: list[LinearRun]) -> Vector:
-    scale = np.sqrt(np.mean(np.concatenate([run.error for run in runs]) ** 2, axis=0))
-    return np.where(scale > 0, scale, 1.0)
-
-
-def _pieces(runs: list[LinearRun], columns: list[np.ndarray], scale: Vector) -> list[np.ndarray]:
-    """Return columns and errors of every run (T, ny, k + 1), in units of each output's errors."""
-    joined = zip(columns, runs, strict=True)
-    return [
-        np.concatenate([one, run.error[..., None]], axis=2) / scale[:, None] for one, run in joined
-    ]
-
-
-def _colour_rows(
-    runs: list[LinearRun], base: list[np.ndarray]
-) -> tuple[list[np.ndarray], list[Vector]]:
-    """Return columns and errors, and the autoregression of each output's remaining errors.
-
-    What the columns explain of the errors is noise, too, and mostly of the frequencies of the
-    inputs. Without it the errors would seem to have hardly any there, and the filter would enlarge
-    what is there until it looks like structure. So noise of the colour found takes its place.
-    """
-    pieces = _pieces(runs, base, _scale(runs))
-    flat, lengths = np.concatenate(pieces), np.cumsum([len(piece) for piece in pieces])[:-1]
-    n, ny = flat.shape[:2]
-    q = _range(flat[..., :-1].reshape(n * ny, -1))
-    target = flat[..., -1].reshape(-1)
-    rest = target - q @ (q.T @ target)
-    colours, shown = [np.ones(1)] * ny, float(np.sqrt(1 - min(q.shape[1] / (n * ny), _MOST_USED)))
-    drawn = np.random.default_rng(_SEED).standard_normal((n, ny))
-    for _ in range(_FILLINGS):
-        sizes = rest.reshape(n, ny).std(axis=0) / shown
-        noise = np.stack([lfilter([1.0], a, drawn[:, o]) for o, a in enumerate(colours)], axis=1)
-        noise = (noise / noise.std(axis=0) * sizes).reshape(-1)
-        whole = np.split((rest + q @ (q.T @ noise)).reshape(n, ny), lengths)
-        found = [whitening_filter([piece[:, o] for piece in whole]) for o in range(ny)]
-        colours = [np.ones(1) if a is None else a for a in found]
-    return pieces, colours
 
 
 def _test_families(
@@ -524,15 +507,15 @@ def _test_families(
     shift: Vector,
 ) -> StructureTest | None:
     """Filter rows and columns by the colour of the remaining errors, and test every family."""
-    nt, known, colours = len(shift), base[0].shape[2], _colour_rows(runs, base)[1]
+    nt, known, colours = len(shift), base[0].shape[2], error_colours(runs, base)[1]
     both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
     whole = np.concatenate(
-        [_filter_piece(piece, colours) for piece in _pieces(runs, both, _scale(runs))]
+        [filter_rows(piece, colours) for piece in stacked_rows(runs, both, error_scale(runs))]
     )
     if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
         return None
     starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
-    q = _range(whole[:, starts])
+    q = span(whole[:, starts])
     # They move a few rows of one run only: blocks would not show them
     whole = whole - q @ (q.T @ whole)
     whole[:, starts] = 0.0
@@ -545,12 +528,31 @@ def _test_families(
     own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
     beside = _family_tests(whole, own, known, families, size, shift)
     hidden = _family_tests(whole, own + simple, known, families, size, None)
-    memory = [entry for entry in beside if entry.kind != "static"]
-    return StructureTest(
+    memory = [entry for entry in beside if entry.kind in KINDS]
+    found = StructureTest(
         _best_family([entry for entry in beside if entry.kind == "static"]),
         _best_family(memory),
-        _best_family([entry for entry in hidden if entry.kind != "static"]),
+        _best_family([entry for entry in hidden if entry.kind in KINDS]),
         tuple(sorted(memory, key=lambda entry: -entry.share)),
+    )
+    drift = _best_family([entry for entry in beside if entry.kind == _DRIFT])
+    others = [one.share for one in (found.static, found.memory) if one is not None]
+    if drift is None or drift.share < max(others, default=0.0):
+        return found
+    return replace(found, drift=_drift_of(whole, own, size, shift, drift))
+
+
+def _drift_of(
+    whole: Matrix, own: list[int], size: Vector, shift: Vector, best: FamilyTest
+) -> ParameterDrift:
+    """Return how far the parameter of a family is from the model's at either end of the record."""
+    place, powers = int(best.on), 2  # the columns of all parameters come last, before the errors
+    first = whole.shape[1] - 1 - powers * (len(shift) - place)
+    taken = [*own, first, first + 1]
+    steps = least_squares(whole[:, taken], whole[:, -1]) * size[-1] / size[taken]
+    middle, (linear, square) = shift[place] + steps[place] + 0.0, steps[-powers:]
+    return ParameterDrift(
+        place, best.share, float(middle - linear + square), float(middle + linear + square)
     )
 
 
@@ -558,25 +560,6 @@ def _best_family(entries: list[FamilyTest]) -> FamilyTest | None:
     return max(
         (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
     )
-
-
-def _range(columns: Matrix) -> Matrix:
-    """Return an orthonormal basis of what columns span, each taken as of size 1."""
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    if not columns.size:
-        return np.zeros((len(columns), 0))
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > 1e-9 * s[0]]
-
-
-def _filter_piece(piece: np.ndarray, colours: list[Vector]) -> Matrix:
-    """Return columns and errors (T, ny, k), filtered by the autoregression of each output."""
-    memory = max(map(len, colours)) - 1
-    rows = np.stack(
-        [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1
-    )
-    return rows.reshape(-1, piece.shape[2])
 
 
 def _family_tests(
@@ -591,7 +574,7 @@ def _family_tests(
 
     `size` are the norms that columns were divided by.
     """
-    q = _range(whole[:, base])
+    q = span(whole[:, base])
     rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
     target, terms = rest[:, -1], rest[:, :-1]
     total, left = float(target @ target), len(whole) - q.shape[1]
@@ -603,7 +586,7 @@ def _family_tests(
         own = [j for j in own if np.linalg.norm(terms[:, j]) > _OWN]
         if not own or not total > 0:
             continue
-        basis = _range(terms[:, own])
+        basis = span(terms[:, own])
         gained, rank = float(np.sum((basis.T @ target) ** 2)), basis.shape[1]
         freedom = left - rank
         p = scipy.special.fdtrc(
@@ -616,7 +599,7 @@ def _family_tests(
             family.equation, family.on, family.kind, share.value, share.error, float(p), term
         )
         if shift is not None and term is not None:
-            step = _least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
+            step = least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
             entry = replace(
                 entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)]))
             )
