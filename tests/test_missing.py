@@ -143,7 +143,7 @@ def test_a_file_without_gaps_is_read_alike(tmp_path):
     np.testing.assert_array_equal(one.experiments[0].outputs, other.experiments[0].outputs)
 
 
-@pytest.mark.parametrize("word", ["", " ", "NaN", "nan", "NA", "N/A", "null", "None"])
+@pytest.mark.parametrize("word", ["", " ", "NaN", "nan", "NA", "N/A", "n.v.", "null", "None", "-"])
 def test_how_a_missing_sample_is_written(tmp_path, word):
     record = read(write(tmp_path / "run.csv", {5: word}, {}))
     assert [len(e) for e in record.experiments] == [5, 94]

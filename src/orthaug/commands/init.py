@@ -170,6 +170,10 @@ def _data(
         data["sampling_time"].comment("s; no column gives it: change it" if unknown else "s")
     for key, names in zip(("inputs", "outputs"), named, strict=True):
         data.add(key, names)
+    apart = found.experiment_column([*roles.inputs, *roles.outputs])
+    if apart is not None:
+        data.add("experiment", apart.header)
+        data["experiment"].comment("its rows of one number are an experiment")
     uneven = time is not None and not clock.even
     if gaps or uneven:
         data.add("missing", "skip")
@@ -570,17 +574,25 @@ def _account(
             "(--inputs, --outputs)"
         )
     lines[2:2] = [f"not the time: column '{one.column.header}' {one.reason}" for one in doubtful]
+    apart = found.experiment_column([*roles.inputs, *roles.outputs])
+    if apart is not None:
+        used.add(id(apart))
+        count = len(np.unique(apart.finite))
+        lines.append(f"{apart.header} numbers {count} experiments; their rows are read apart")
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
     if missing:
-        filled = any(kind == "fill" for kind, _ in steps_of(found, roles))
+        kinds = [kind for kind, _ in steps_of(found, roles)]
+        filled = "fill" in kinds
         lines.append(f"{gap_text(missing)} and will be left out, with all windows that touch them")
         if filled:
             lines[-1] = (
                 f"{gap_text(missing)}: gaps of up to {FILLED} rows are filled, longer ones left out"
             )
+        elif "resample" in kinds:
+            lines[-1] = f"{gap_text(missing)}: resampling interpolates what is missing shortly"
     lines += [wild] if wild else []
     lines += notes
     for name, late, seen in zip(
@@ -653,7 +665,7 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     if column.quantum is not None:
         moves = (
             f", while it moves by {column.movement:.2g} from row to row"
-            if column.quantum > column.movement
+            if column.quantum > column.movement and not column.held
             else ""
         )
         text += f"; in steps of {column.quantum:.3g}{moves}"

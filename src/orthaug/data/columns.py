@@ -77,6 +77,11 @@ class Column:
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property
+    def held(self) -> bool:
+        """True if it keeps its value from most rows to the next."""
+        return len(self.finite) > 1 and bool(np.mean(np.diff(self.finite) == 0) > 0.5)
+
+    @property
     def limits(self) -> tuple[tuple[float, int], ...]:
         """Extreme values that the signal has much more often than others, with the rows.
 

@@ -26,7 +26,8 @@ _REMARK = ("#", "%")  # lines above the header that begin so
 _NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*')
 _COMMA = re.compile(r"(\d*),(\d+)")
 _DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
-_MISSING = ("", "nan", "na", "n/a", "null", "none")
+MISSING = ("", "nan", "na", "n/a", "#n/a", "n.a.", "n.v.", "null", "none", "-", "--")
+"""Words of a cell without a sample, in small letters."""
 _BLANK = " "  # the separator that means any run of spaces and tabs
 _SEPARATORS = ("\t", ";", ",", _BLANK)
 _WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
@@ -242,7 +243,7 @@ def _is_row(cells: list[str], separator: str) -> bool:
         _is_number(cell, separator) or _DATE.fullmatch(cell.strip()) is not None for cell in cells
     ]
     return any(found) and all(
-        good or cell.strip().lower() in _MISSING for good, cell in zip(found, cells, strict=True)
+        good or cell.strip().lower() in MISSING for good, cell in zip(found, cells, strict=True)
     )
 
 

@@ -18,7 +18,7 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, show
 from orthaug._base.lines import plural
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
-from orthaug.data.layouts import text_number
+from orthaug.data.layouts import MISSING, text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import (
     Channel,
@@ -39,7 +39,6 @@ _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by,
 GAP = 10.0
 _LATEST = 1e11  # s; later than the year 5000
 # How files write a sample that is not there
-_MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")
 
 
 def read_record(
@@ -399,7 +398,7 @@ def _stretches(
         for name in columns:
             if (
                 not np.isfinite(table.columns[name][row])
-                and table.cell(name, row).strip().lower() not in _MISSING
+                and table.cell(name, row).strip().lower() not in MISSING
             ):
                 _check_cells(table, [name], row, row + 1)
     ranges = unbroken(
@@ -420,7 +419,7 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             row = start + int(bad[0])
             text = table.cell(name, row)
             what = f"found '{text}'" if text else "the cell is empty"
-            error = MissingSampleError if text.strip().lower() in _MISSING else InputError
+            error = MissingSampleError if text.strip().lower() in MISSING else InputError
             dated, number = name == table.dated, np.isfinite(text_number(text))
             kind = "a date" if dated else "decimals with commas" if number else ""
             wanted = f"{kind}, as in other cells" if kind else "a finite number"

@@ -18,6 +18,9 @@ from orthaug.data.layouts import numbers_only
 from orthaug.data.tables import column_names, read_table, reading_note
 from orthaug.data.variables import ENDINGS
 
+_MOST_EXPERIMENTS = 50  # that a column of the file may number
+_SHORTEST_EXPERIMENT = 20  # rows
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -48,6 +51,24 @@ class Survey:
         return column.unusable or (
             "constant" if column.constant else refused.reason if refused else "not named"
         )
+
+    def experiment_column(self, used: Sequence[Column]) -> Column | None:
+        """Return the column that numbers the experiments: whole numbers, each in one block of rows.
+
+        None where there is none beside the `used` ones.
+        """
+        for column in self.columns:
+            if any(column is one for one in (*used, self.clock.column)) or column.unusable:
+                continue
+            values = column.values[: column.filled]
+            if not np.isfinite(values).all() or (values != np.round(values)).any():
+                continue
+            blocks = np.split(values, np.flatnonzero(np.diff(values)) + 1)
+            several = 1 < len(blocks) <= _MOST_EXPERIMENTS
+            apart = len(np.unique(values)) == len(blocks)
+            if several and apart and min(map(len, blocks)) >= _SHORTEST_EXPERIMENT:
+                return column
+        return None
 
     def same_lengths(self, columns: Sequence[Column]) -> bool:
         """Return whether columns belong to one run.

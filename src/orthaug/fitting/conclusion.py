@@ -384,9 +384,9 @@ def conclude_motion(
         plan: the segments that were trained on.
         learned: of these segments.
         alone: coordinates of physics alone; None where no run of it is finite.
-        briefly: leave out the choice of a window to predict from, on which no free run depends and
-            which takes longer than a short training. The split stays: beyond the data the physics
-            goes on as it is split, and the correction fades.
+        briefly: leave out the choice of a window to predict from and the statistics, on which no
+            free run depends and which take longer than a short training. The split stays: beyond
+            the data the physics goes on as it is split, and the correction fades.
     """
     problem, begins = plan.problem, alone is not None
     assert learned.coefficients is not None and learned.errors is not None
@@ -426,11 +426,10 @@ def conclude_motion(
         scores=learned.scores,
         warnings=(*without_loss(errors.mean_square), *unsettled, *silent),
     )
-    return (
-        fit.split(structure.measure, getattr(structure, "shared", "auto"))
-        if learned.ending.usable
-        else fit
-    )
+    if not learned.ending.usable:
+        return fit
+    shared = getattr(structure, "shared", "auto")
+    return fit.split_by_measure(structure.measure, shared, statistics=not briefly)
 
 
 def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | None:

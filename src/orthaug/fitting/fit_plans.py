@@ -180,7 +180,8 @@ class FitPlan(ABC, Generic[P]):
     def choice(self, *, auto: bool) -> Choice:
         """Return how the best run is chosen; `auto` for regularizations that "auto" declares."""
         request = self.request
-        blocks = 0 if request.warm else request.blocks
+        # A brief fit is judged on rows that it never sees
+        blocks = 0 if request.warm or request.briefly else request.blocks
         return Choice(request.validation, blocks, request.fallback, briefly=request.briefly)
 
     def solve(self, task: Any) -> Estimate | None:

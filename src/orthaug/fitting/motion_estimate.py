@@ -95,11 +95,17 @@ class MotionEstimate(Estimate):
             InputError: a measure that does not fit the motion.
         """
         check_type(measure, Measure, "measure", "a measure such as Uniform()")
+        return self.split_by_measure(measure, shared)
+
+    def split_by_measure(
+        self, measure: Measure, shared: str, *, statistics: bool = True
+    ) -> MotionEstimate:
+        """Return the same motion with p̂ under a measure, and its `statistics` or p̂ alone."""
         form, segmented = self.model.form, self.segmented
         whole = fitted_numbers(self.model.numbers)
         field, support, of_measure = field_under(measure, segmented, whole, self.states)
         moving = None
-        if isinstance(measure, Training) and self.slope is not None:
+        if isinstance(measure, Training) and self.slope is not None and statistics:
             moving = partial(
                 wobble,
                 segmented.dynamics,
@@ -110,7 +116,7 @@ class MotionEstimate(Estimate):
                 field.size,
             )
         bounds = self.problem.motion.coordinates.bounds
-        options = {"everything": shared == "all", "wobble": moving}
+        options = {"everything": shared == "all", "wobble": moving, "statistics": statistics}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
         split = replace(split, support=support, of_rows=isinstance(measure, OF_ROWS))
         return _with_split(self, split, of_measure)

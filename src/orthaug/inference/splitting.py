@@ -424,6 +424,7 @@ def split_motion(
     *,
     everything: bool = False,
     wobble: Any = None,
+    statistics: bool = True,
 ) -> MotionSplit:
     """Return p̂ of a fitted motion under a measure.
 
@@ -433,6 +434,7 @@ def split_motion(
         everything: whether all directions count as shared (the paper's projection).
         wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's;
             None where they are fixed.
+        statistics: how p̂ follows (c, w), and the measures of what is left; without, p̂ alone.
     """
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
@@ -442,6 +444,8 @@ def split_motion(
         own = {"name": name, "field": field, "slope": np.eye(count)}
         return MotionSplit(q=c, shared=nothing, defect=None, **own)
     q, shared = nearest(form, numbers, start, field, bounds, basis)
+    if not statistics:
+        return MotionSplit(name=name, q=q, shared=shared, field=field, slope=None, defect=None)
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
     second, to_c, to_w, gauss, gradient, learner, rest, size = (
         np.asarray(part) for part in _sum_over(_second, form, numbers, q, field)
