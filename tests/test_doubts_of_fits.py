@@ -5,7 +5,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
-from orthaug.analysis.input_timing import try_holds
+from orthaug.analysis.input_timing import LateInput, try_holds
 from orthaug.analysis.missing_terms import missing_terms
 
 TS = 0.1
@@ -267,3 +267,99 @@ def test_a_gap_between_two_angles_is_missing_physics():
     found = oa.estimate(record, motion, learner=None).diagnose()
     assert found.residuals.verdict == "unmodelled"
     assert all(row.ci95_counts == "noise only" for row in found.parameters if row.ci95)
+
+
+def stepped(rows: int, seed: int, held: int = 12) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).uniform(-1, 1, rows // held + 1), held)[:rows]
+
+
+def test_a_parameter_that_changes_over_the_record_is_named_with_both_ends():
+    """A coil that warms up: its resistance rises by a half; under a constant one nothing is said."""
+    said = {}
+    for rise in (0.4, 0.0):
+        u, i, y = stepped(1500, 5), 0.0, []
+        for k, value in enumerate(u):
+            y.append(i)
+            i += 0.05 * (value - (0.8 + rise * k / 1500) * i) / 0.5
+        noisy = np.array(y) + 2e-3 * np.random.default_rng(6).normal(size=1500)
+        motion = oa.Motion.from_equations(
+            [oa.State("i", "(u - R*i)/L", start="y")],
+            [oa.Output("y", "i")],
+            [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 0.4, min=0)],
+            ["u"],
+            hold="zero-order",
+        )
+        record = oa.Record.from_arrays(u, noisy, sampling_time=0.05)
+        found = oa.estimate(record, motion, learner=None).diagnose()
+        said[rise] = {w.code: w.text for w in found.warnings}
+        if rise:
+            counts = [row.ci95_counts for row in found.parameters]
+            assert counts == ["noise only", "noise only"]
+    assert "parameter_drift" not in said[0.0]
+    text = said[0.4]["parameter_drift"]
+    begin, end = (float(text.split(word)[1].split(" at its")[0]) for word in ("from ", "begin to "))
+    assert text.startswith("R seems to change")
+    assert begin == pytest.approx(0.8, abs=0.06) and end == pytest.approx(1.2, abs=0.06)
+
+
+def test_a_product_of_state_and_input_is_tried_as_missing_physics():
+    """The force factor of a loudspeaker falls with the square of its stroke."""
+    u, x, v, y = stepped(1500, 7), 0.0, 0.0, []
+    for value in u:
+        y.append(x)
+        for _ in range(10):
+            x, v = x + 0.005 * v, v + 0.005 * ((3 - x**2) * value * 4 - 1.5 * v - 9 * x)
+    noisy = np.array(y) + 1e-3 * np.random.default_rng(8).normal(size=1500)
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", start="y"),
+            oa.State("v", "b*u - c*v - k*x", start="derivative of y"),
+        ],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter(name, at, min=0) for name, at in (("b", 10), ("c", 1), ("k", 8))],
+        ["u"],
+        hold="zero-order",
+    )
+    record = oa.Record.from_arrays(u, noisy, sampling_time=0.05)
+    found = missing_terms(oa.estimate(record, motion, learner=None))
+    best = found.terms[0]
+    assert (best.equation, best.variable, best.shape) == ("v", "x**2*u", "linear")
+    assert best.variables == ("x", "u") and best.share > 0.8
+    assert best.coefficient == pytest.approx(-4, rel=0.2)
+
+
+def test_a_mode_that_the_integrator_distorts_is_no_other_solution():
+    """A fast mode far below a step is right under long steps alone: no warning names it."""
+    u, x, wall, y = stepped(1200, 9, held=6), 0.0, 0.0, []
+    for value in u:
+        y.append(x)
+        for _ in range(20):
+            x, wall = (
+                x + 0.05 * (value - x + 2 * (wall - x)) / 6,
+                wall + 0.05 * (x - wall) / 50,
+            )
+    noisy = np.array(y) + 2e-3 * np.random.default_rng(10).normal(size=1200)
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "(u - x + g*(z - x))/C", start="y"),
+            oa.State("z", "(x - z)/W", start=0.0),
+        ],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter(n, at, min=0) for n, at in (("g", 1), ("C", 8), ("W", 40))],
+        ["u"],
+        hold="zero-order",
+    )
+    record = oa.Record.from_arrays(u, noisy, sampling_time=1.0)
+    fit = oa.estimate(record, motion, learner=None)
+    np.testing.assert_allclose(fit.values, [2, 6, 50], rtol=0.1)
+    codes = {w.code for w in fit.diagnose().warnings}
+    assert not codes & {"several_solutions", "local_minimum", "parameter_drift"}
+
+
+def test_a_lag_that_a_delay_explains_nearly_as_well_leaves_both_open():
+    late = LateInput("u", 0.05, 2, 0.122, 2, 0.115, 0.178)
+    assert late.alike and late.warning.code == "slow_input"
+    assert "too close to tell" in late.warning.text and 'step = "shift"' in late.warning.text
+    sure = LateInput("u", 0.05, 2, 0.05, 2, 0.115, 0.178)
+    assert not sure.alike and sure.warning.code == "dead_time"
+    assert "too close" not in sure.warning.text

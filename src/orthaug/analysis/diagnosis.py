@@ -185,7 +185,8 @@ def _of_motion(
             Warning("coloured_residual", colour_sentence(fit) + (_UNCOUNTED if explained else ""))
         ]
     )
-    return Diagnosis(verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
+    found = (verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
+    return Diagnosis(*found, late=late)
 
 
 def _late_inputs(fit: MotionEstimate) -> tuple[LateInput, ...]:

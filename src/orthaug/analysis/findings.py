@@ -162,6 +162,21 @@ class MissingResult(Content):
     terms: list[MissingTermResult]
 
 
+class LateInputResult(Content):
+    """An input that acts later than in the equations, with what each way leaves."""
+
+    input: str
+    delay: int
+    """Samples."""
+    delayed: Number
+    time_constant: Number
+    """Of a first-order lag, in s."""
+    lagged: Number
+    declared: Number
+    by_lag: bool
+    alike: bool
+
+
 class DiagnosisResult(Content):
     """Diagnosis of the residuals: the kind of noise, and the change that would help."""
 
@@ -176,6 +191,7 @@ class DiagnosisResult(Content):
     predictable: list[Predictable]
     changes: list[Change]
     missing: MissingResult | None = None
+    late: list[LateInputResult] = []
     steps: ByName | None = None
 
 

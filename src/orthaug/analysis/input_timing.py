@@ -205,13 +205,18 @@ class LateInput:
     def gain(self) -> str:
         """Gain by the better one, beside the other, in words."""
         late = f"a delay of {self.delay} sample{'s' * (self.delay > 1)}"
-        slow = f"a first-order lag of {self.lag * self.sampling_time:.3g} s"
+        slow = f"a first-order lag of {self.time_constant:.3g} s"
         pairs = [(slow, self.lagged), (late, self.delayed)]
         (better, least), (other, more) = pairs if self.by_lag else pairs[::-1]
         return (
             f"with {better} the error of physics alone is {least:.3g} standard deviations of the "
             f"output instead of {self.declared:.3g} ({more:.3g} with {other})"
         )
+
+    @property
+    def time_constant(self) -> float:
+        """Of the lag, in s."""
+        return self.lag * self.sampling_time
 
     @property
     def alike(self) -> bool:

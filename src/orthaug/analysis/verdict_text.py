@@ -76,6 +76,8 @@ class Diagnosis:
     predictable: tuple[Predictable, ...] = ()
     changes: tuple[Change, ...] = ()
     missing: MissingTest | None = None
+    late: tuple[LateInput, ...] = ()
+    """Inputs of a motion that act later than in its equations."""
     steps: Mapping[str, float] | None = None
 
     def __repr__(self) -> str:

@@ -70,6 +70,7 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
             list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
         )
     found = [
+        *_lags(job, result),
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),
@@ -89,6 +90,15 @@ def _is_biased(result: FitResult) -> bool:
     return any(
         row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ()))
     )
+
+
+def _lags(job: Job, result: FitResult) -> Iterator[Proposal]:
+    """Yield a state for each input that acts through a lag."""
+    for late in result.residuals.late if result.residuals is not None else ():
+        made = job.physics.with_lag(job, late, _new_name(job, "T"))
+        if made is not None and (late.by_lag or late.alike):
+            change, words = made
+            yield Proposal(words, change)
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
@@ -144,11 +154,11 @@ def _term(
         yield Proposal(f"{what} {where}", change, positive=name if positive else None)
 
 
-def _new_name(job: Job) -> str:
+def _new_name(job: Job, word: str = "size") -> str:
     """Return a name for a parameter that the spec does not use."""
     spec, number = job.spec, 1
     taken = {*spec.data.inputs, *spec.data.outputs, *job.physics.names_taken(spec)}
-    while (name := f"size{number if number > 1 else ''}") in taken:
+    while (name := f"{word}{number if number > 1 else ''}") in taken:
         number += 1
     return name
 
@@ -446,11 +456,11 @@ def _conclude_trials(
 
 def _relative_clause(better: int, tried: int) -> str:
     if tried == 1:
-        return "which improves it" if better else "which does not improve it"
+        return "which improves it" if better else "which does not surely improve it"
     return (
         "of which "
         f"{'none' if not better else 'one' if better == 1 else better} "
-        f"{'improve' if better > 1 else 'improves'} it"
+        f"{'improve' if better > 1 else 'improves' if better else 'surely improves'} it"
     )
 
 

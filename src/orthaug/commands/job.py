@@ -25,7 +25,7 @@ from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
-    from orthaug.analysis.findings import SuspectResult
+    from orthaug.analysis.findings import LateInputResult, SuspectResult
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
     from orthaug.fitting.estimates import Estimate
@@ -198,6 +198,17 @@ class JobPhysics(ABC, Generic[P, F]):
         Args:
             name: of the new parameter, the term's coefficient.
             place: the output or equation that lacks the term; None where there is one only.
+        """
+
+    def with_lag(
+        self, job: Job, late: LateInputResult, name: str
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change of a spec by which an input acts through a lag, and what that is.
+
+        None where the physics cannot have it.
+
+        Args:
+            name: of a new parameter, the time constant.
         """
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from orthaug.reports.result import CheckResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
+    from orthaug.analysis.findings import LateInputResult
     from orthaug.analysis.input_timing import Trial
     from orthaug.fitting.motion_estimate import MotionEstimate
     from orthaug.models.response import Response
@@ -118,6 +120,29 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.parameters.{name}": {"initial": initial},
         }
         return change, f"in the equation of {place}"
+
+    def with_lag(
+        self, job: Job, late: LateInputResult, name: str
+    ) -> tuple[dict[str, Any], str] | None:
+        motion, states = self.motion, job.declaration.get("motion", {}).get("states")
+        state = f"{late.input}_late"
+        if not states or motion.functions is not None or motion.scheme.discrete:
+            return None
+        if motion.definitions or state in {*self.names_taken(job.spec), *motion.inputs}:
+            return None
+        key, word = motion.equation_key, re.compile(rf"\b{re.escape(late.input)}\b")
+        change: dict[str, Any] = {
+            f"motion.states.{other}.{key}": word.sub(state, str(entry[key]))
+            for other, entry in states.items()
+        }
+        record = job.train.record
+        place = [channel.name for channel in record.inputs].index(late.input)
+        first = float(record.experiments[0].inputs[0, place])
+        change |= {
+            f"motion.states.{state}": {key: f"({late.input} - {state})/{name}", "start": first},
+            f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
+        }
+        return change, f"a lag of {late.input} (the state {state}, time constant {name})"
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:

@@ -349,7 +349,7 @@ def _growth(slopes: Float[np.ndarray, "r n x"] | None) -> float:
 def is_unstable(fit: MotionEstimate) -> bool:
     """Return whether errors of the states of a fit's predictor grow from sample to sample."""
     numbers = fit.model.numbers
-    return _growth(_slopes(fit.segmented, numbers.c, numbers.weights, fit.states)) >= 1
+    return _growth(_slopes(fit.segmented, np.asarray(numbers.c), numbers.weights, fit.states)) >= 1
 
 
 def stable_or_white(
