@@ -359,7 +359,7 @@ def test_a_mode_that_the_integrator_distorts_is_no_other_solution():
 def test_a_lag_that_a_delay_explains_nearly_as_well_leaves_both_open():
     late = LateInput("u", 0.05, 2, 0.122, 2, 0.115, 0.178)
     assert late.alike and late.warning.code == "slow_input"
-    assert "too close to tell" in late.warning.text and 'step = "shift"' in late.warning.text
+    assert "hardly distinguish" in late.warning.text and 'step = "shift"' in late.warning.text
     sure = LateInput("u", 0.05, 2, 0.05, 2, 0.115, 0.178)
     assert not sure.alike and sure.warning.code == "dead_time"
-    assert "too close" not in sure.warning.text
+    assert "hardly distinguish" not in sure.warning.text

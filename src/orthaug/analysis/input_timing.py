@@ -25,7 +25,7 @@ ROWS = 4000  # at most
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
-_ALIKE = 0.25  # of what the better gains: by less a lag and a delay are not told apart
+_ALIKE = 0.25  # of what the better gains: by less a lag and a delay are not distinguished
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -220,7 +220,7 @@ class LateInput:
 
     @property
     def alike(self) -> bool:
-        """True if the data hardly tell a lag from a delay."""
+        """True if the data hardly distinguish a lag from a delay."""
         gained = self.declared - min(self.lagged, self.delayed)
         return abs(self.lagged - self.delayed) < _ALIKE * gained
 
@@ -244,7 +244,7 @@ class LateInput:
         code = "slow_input" if self.by_lag else "dead_time"
         if self.alike:
             remedy = (
-                "The two are too close to tell a lag from a delay. If a drive, a filter or a "
+                "The data hardly distinguish a lag from a delay. If a drive, a filter or a "
                 f"sensor is slow, {slow} If there is a dead time, {late}"
             )
         elif self.by_lag:

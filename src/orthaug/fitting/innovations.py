@@ -55,9 +55,7 @@ from orthaug.physics.problem import MotionProblem
 
 _PROCESS = (1e-6, 1e-4, 1e-2, 1.0)  # variance of a state in a sample, of its own, to begin with
 _POINTS = 64  # at which the motion is linearised
-_LONG = (
-    30  # time constants, from which on a record tells white process noise from slow disturbances
-)
+_LONG = 30  # time constants, from which on a record shows whether process noise is white
 _INTEGRATES = 1 - 1e-6  # magnitude of a pole that has no time constant
 
 
@@ -378,7 +376,7 @@ def _without_gain(white: MotionEstimate, coloured: MotionEstimate) -> MotionEsti
 
 
 def check_length(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> list[Warning]:
-    """Return a warning where the record is too short to tell what kind the process noise is.
+    """Return a warning where the record is too short to show what kind the process noise is.
 
     K describes process noise that is independent from sample to sample. Of a disturbance that lasts
     (ambient temperature, a supply, wind) the innovations look as white in a short record, and θ is
@@ -402,8 +400,8 @@ def check_length(plan: SegmentedMotion, c: Vector, w: Any, states: Any) -> list[
     seconds = plain_number(samples * plan.problem.record.sampling_time)
     text = (
         f"the record is {plain_number(rows / samples)} time constants long (the slowest is "
-        f"{seconds} s): too short to tell process noise from a disturbance that lasts. The 95 % "
-        "intervals count process noise that is independent from sample to sample. Where a "
+        f"{seconds} s): too short to distinguish process noise from a disturbance that lasts. "
+        "The 95 % intervals count process noise that is independent from sample to sample. Where a "
         "disturbance lasts (ambient temperature, a supply, wind), parameters may be off by "
         "several standard errors more. Measure it as an input, or fit a second record and compare."
     )
