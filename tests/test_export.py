@@ -310,6 +310,9 @@ def run_fmu(folder: Path, given: Case):
     assert validate_fmu(str(folder / "plant.fmu")) == []
     described = fmpy.read_model_description(str(folder / "plant.fmu"))
     place = fmpy.extract(str(folder / "plant.fmu"), folder.parent / "unpacked")
+    stated = [v for v in described.modelVariables if v.unit]
+    assert all(v.description.endswith(f" [{v.unit}]") for v in stated)
+    assert {v.unit for v in stated} == {unit.name for unit in described.unitDefinitions}
     by = {kind: [v.valueReference for v in described.modelVariables if v.causality == kind] for kind in
           ("input", "output", "local")}  # fmt: skip
     fmu = FMU2Slave(

@@ -169,12 +169,16 @@ def _description(program: Program) -> str:
             taken.add(name)
             start = ' start="0"' if causality != "output" else ""
             exact = f' initial="{initial}"' if initial else ""
+            unit = f" unit={quoteattr(signal.unit)}" if signal.unit else ""
             variables.append(
                 f"    <ScalarVariable name={quoteattr(name)} "
                 f'valueReference="{len(variables)}" causality="{causality}" '
                 f'variability="{variability}"{exact} description={quoteattr(signal.label)}>'
-                f"<Real{start}/></ScalarVariable>"
+                f"<Real{unit}{start}/></ScalarVariable>"
             )
+    units = dict.fromkeys(s.unit for _, _, _, signals in kinds for s in signals if s.unit)
+    named = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
+    definitions = f"\n  <UnitDefinitions>{named}</UnitDefinitions>" if named else ""
     first = len(program.inputs) + 1
     outputs = "".join(f'<Unknown index="{first + i}"/>' for i in range(len(program.outputs)))
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -183,7 +187,7 @@ def _description(program: Program) -> str:
   variableNamingConvention="structured">
   <CoSimulation modelIdentifier="{program.name}" canHandleVariableCommunicationStepSize="true">
     <SourceFiles>{"".join(f'<File name="{name}"/>' for name in _SOURCES)}</SourceFiles>
-  </CoSimulation>
+  </CoSimulation>{definitions}
   <DefaultExperiment startTime="0" stepSize="{program.sampling_time!r}"/>
   <ModelVariables>
 {chr(10).join(variables)}
