@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -55,6 +55,11 @@ class Sensitivities:
     starts: int
     nuisance: int
     """n0, and n0 + n."""
+
+    def with_terms(self, kept: Bool[np.ndarray, "q"]) -> Sensitivities:
+        """Return the same with some of the added terms."""
+        every = np.concatenate([np.ones(self.nuisance, dtype=bool), kept])
+        return replace(self, columns=self.columns[..., every])
 
 
 @partial(quick_jit, static_argnames="form")
@@ -320,6 +325,14 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     if tested is None:
         return None
     p, freedom, share, gains, shares, coefficients = tested
+    if products:
+        # Simple terms are tested by themselves, too: products would take power from them
+        by_term = np.arange(len(gains)) % count < count - len(products)
+        alone = _joint_test(found.with_terms(by_term))
+        if alone is not None and alone[0] < p:
+            p, freedom, share = alone[:3]
+        p = min(2 * p, 1.0)
+        gains = np.where(by_term, gains, _RIVAL * gains)
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
     made = (motion, equations, names, products)
     listed = [_term(*made, j, coefficients, shares, *found_of[0]) for j in order]

@@ -104,7 +104,8 @@ def _steps(
     matrix: Float[np.ndarray, "m n0 n0"], right: Float[np.ndarray, "m n0"], damping: Vector
 ) -> Float[np.ndarray, "n0 m"]:
     size = np.diagonal(matrix, axis1=1, axis2=2)
-    damped = matrix + (damping[:, None] * size)[:, :, None] * np.eye(matrix.shape[1])
+    with np.errstate(all="ignore"):  # a window whose run leaves all bounds takes no step
+        damped = matrix + (damping[:, None] * size)[:, :, None] * np.eye(matrix.shape[1])
     sound: Any = np.isfinite(damped).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
     damped = np.where(sound[:, None, None], damped, np.eye(matrix.shape[1]))
     right = np.where(sound[:, None], right, 0.0)
