@@ -217,8 +217,10 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
 
 def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
     """Return a warning of a parameter that changes over the record; none where it hardly does."""
-    name, now = fit.problem.names[drift.place], np.asarray(fit.theta, dtype=float)
-    place = np.arange(len(now)) == drift.place
+    names, now = fit.problem.names, np.asarray(fit.theta, dtype=float)
+    if len(names) != len(now):
+        return []
+    name, place = names[drift.place], np.arange(len(now)) == drift.place
     ends = [
         float(fit.problem.values_at(now + np.where(place, moved, 0.0))[drift.place])
         for moved in (drift.begin, drift.end)
