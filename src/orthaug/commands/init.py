@@ -665,7 +665,7 @@ def as_seen(column: Column, *, spikes: bool) -> str:
     if column.quantum is not None:
         moves = (
             f", while it moves by {column.movement:.2g} from row to row"
-            if column.quantum > column.movement and not column.held
+            if column.quantum > column.movement and not column.switched
             else ""
         )
         text += f"; in steps of {column.quantum:.3g}{moves}"

@@ -77,9 +77,9 @@ class Column:
         return len(self.finite) > 0 and bool(np.ptp(self.finite) == 0)
 
     @property
-    def held(self) -> bool:
-        """True if it keeps its value from most rows to the next."""
-        return len(self.finite) > 1 and bool(np.mean(np.diff(self.finite) == 0) > 0.5)
+    def switched(self) -> bool:
+        """True if it is switched between a few levels: their distance is no resolution."""
+        return len(np.unique(self.finite)) <= _LEVELS
 
     @property
     def limits(self) -> tuple[tuple[float, int], ...]:
