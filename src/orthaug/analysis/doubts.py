@@ -216,7 +216,7 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
 
 
 def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
-    """Return a warning of a parameter that changes over the record; none where it hardly does."""
+    """Return a warning of a parameter that changes over the record; none without finite values."""
     names, now = fit.problem.names, np.asarray(fit.theta, dtype=float)
     if len(names) != len(now):
         return []

@@ -6,10 +6,13 @@ import numpy as np
 from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import span
 from orthaug.analysis.output_response import LinearRun
 from orthaug.fitting.whiteness import whitening_filter
 
 _FILLINGS, _SEED = 3, 20261125  # of what the columns explain with noise, and their key
+RANK = 1e-9
+"""Singular value over the largest of columns that responses of a run are independent from."""
 _MOST_USED = 0.9  # of the rows, by columns
 
 
@@ -41,7 +44,7 @@ def error_colours(
     pieces = stacked_rows(runs, base, error_scale(runs))
     flat, lengths = np.concatenate(pieces), np.cumsum([len(piece) for piece in pieces])[:-1]
     n, ny = flat.shape[:2]
-    q = span(flat[..., :-1].reshape(n * ny, -1))
+    q = span(flat[..., :-1].reshape(n * ny, -1), RANK)
     target = flat[..., -1].reshape(-1)
     rest = target - q @ (q.T @ target)
     colours, shown = [np.ones(1)] * ny, float(np.sqrt(1 - min(q.shape[1] / (n * ny), _MOST_USED)))
@@ -63,20 +66,3 @@ def filter_rows(piece: np.ndarray, colours: list[Vector]) -> Matrix:
         [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1
     )
     return rows.reshape(-1, piece.shape[2])
-
-
-def span(columns: Matrix) -> Matrix:
-    """Return an orthonormal basis of what columns span, each taken as of size 1."""
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    if not columns.size:
-        return np.zeros((len(columns), 0))
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > 1e-9 * s[0]]
-
-
-def least_squares(columns: Matrix, target: Vector) -> Vector:
-    """Return the coefficients of columns of any size."""
-    size = np.linalg.norm(columns, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size

@@ -20,12 +20,12 @@ import numpy as np
 import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import least_squares, span
 from orthaug.analysis.filtered_rows import (
+    RANK,
     error_colours,
     error_scale,
     filter_rows,
-    least_squares,
-    span,
     stacked_rows,
 )
 from orthaug.analysis.memory import KINDS, MemoryTerm, memory_terms
@@ -147,7 +147,7 @@ class StructureTest:
 
     @property
     def state(self) -> FamilyTest | None:
-        """The family with memory that tells of a state; None where what it tells of is a lag.
+        """The family with memory that shows a hidden state; None where it shows a missing lag.
 
         Where an input seems to act a sample or two late and memory of a state predicts nearly as
         much, it is the state.
@@ -258,7 +258,7 @@ def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
     """
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1.0)
-    q = span(others)
+    q = span(others, RANK)
     rest = columns / size
     rest = rest - q @ (q.T @ rest)
     left, values, right = np.linalg.svd(rest, full_matrices=False)
@@ -268,7 +268,7 @@ def _step_beside(columns: Matrix, others: Matrix, target: Vector) -> Vector:
 
 def _residual_sum(columns: Matrix, target: Vector) -> float:
     """Return the sum of squares that columns leave."""
-    q = span(columns)
+    q = span(columns, RANK)
     rest = target - q @ (q.T @ target)
     return float(rest @ rest)
 
@@ -515,7 +515,7 @@ def _test_families(
     if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
         return None
     starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
-    q = span(whole[:, starts])
+    q = span(whole[:, starts], RANK)
     # They move a few rows of one run only: blocks would not show them
     whole = whole - q @ (q.T @ whole)
     whole[:, starts] = 0.0
@@ -550,7 +550,7 @@ def _drift_of(
     first = whole.shape[1] - 1 - powers * (len(shift) - place)
     taken = [*own, first, first + 1]
     steps = least_squares(whole[:, taken], whole[:, -1]) * size[-1] / size[taken]
-    middle, (linear, square) = shift[place] + steps[place] + 0.0, steps[-powers:]
+    middle, (linear, square) = shift[place] + steps[place], steps[-powers:]
     return ParameterDrift(
         place, best.share, float(middle - linear + square), float(middle + linear + square)
     )
@@ -574,7 +574,7 @@ def _family_tests(
 
     `size` are the norms that columns were divided by.
     """
-    q = span(whole[:, base])
+    q = span(whole[:, base], RANK)
     rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
     target, terms = rest[:, -1], rest[:, :-1]
     total, left = float(target @ target), len(whole) - q.shape[1]
@@ -586,7 +586,7 @@ def _family_tests(
         own = [j for j in own if np.linalg.norm(terms[:, j]) > _OWN]
         if not own or not total > 0:
             continue
-        basis = span(terms[:, own])
+        basis = span(terms[:, own], RANK)
         gained, rank = float(np.sum((basis.T @ target) ** 2)), basis.shape[1]
         freedom = left - rank
         p = scipy.special.fdtrc(

@@ -24,6 +24,7 @@ import scipy.special
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import span
 from orthaug._base.jax import Array, padded_length, quick_jit
 from orthaug.analysis.suspects import changes_sign
 from orthaug.fitting.motion_estimate import MotionEstimate, fitted_numbers
@@ -447,7 +448,7 @@ def _joint_test(
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
     if plain is None or null is None:
         return None
-    basis = _range(null.terms, _RANK)
+    basis = span(null.terms, _RANK)
     rank, freedom = basis.shape[1], null.left - basis.shape[1]
     total = float(null.errors @ null.errors)
     if rank == 0 or freedom < _ROWS_PER_COLUMN * rank or not total > 0:
@@ -455,7 +456,7 @@ def _joint_test(
     explained = float(np.sum((basis.T @ null.errors) ** 2))
     rest = max(total - explained, np.finfo(float).eps * total)
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
-    basis = _range(plain.terms, _RANK)
+    basis = span(plain.terms, _RANK)
     beside = _regression(found, _filters(found, plain.errors - basis @ (basis.T @ plain.errors)))
     rows = null if beside is None else beside
     size = np.einsum("rj,rj->j", rows.terms, rows.terms)
@@ -489,12 +490,12 @@ def _regression(
     parts, used = [], 0
     for block in rows:  # the starts move their own segment only
         starts, rest = block[:, : found.starts], block[:, found.starts :]
-        q = _range(starts)
+        q = span(starts)
         used += q.shape[1]
         parts.append(rest - q @ (q.T @ rest))
     whole = np.concatenate(parts)
     unknowns = found.nuisance - found.starts
-    q = _range(whole[:, :unknowns])
+    q = span(whole[:, :unknowns])
     rest = whole[:, unknowns:]
     before = np.linalg.norm(np.concatenate(rows)[:, found.nuisance : -1], axis=0)
     rest = rest - q @ (q.T @ rest)
@@ -504,16 +505,6 @@ def _regression(
     if left < _ROWS_PER_COLUMN * terms.shape[1] or not np.isfinite(whole).all():
         return None
     return _Regression(terms, errors, left)
-
-
-def _range(columns: Matrix, rank: float = 1e-10) -> Matrix:
-    """Return an orthonormal basis of what columns span, each taken as of size 1."""
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    if not columns.size:
-        return np.zeros((len(columns), 0))
-    u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, s > rank * s[0]]
 
 
 def _filter_segment(

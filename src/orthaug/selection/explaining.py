@@ -18,6 +18,7 @@ import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import least_squares, span
 from orthaug._base.errors import InputError
 from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, suspect_text
 from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
@@ -121,20 +122,8 @@ def project_out_basis(values: np.ndarray, basis: Float[np.ndarray, "R k"]) -> np
 
 
 def basis_of(columns: Sequence[Vector] | Matrix) -> Float[np.ndarray, "R k"]:
-    """Return an orthonormal basis of columns, each taken as of size 1."""
-    if not len(columns):
-        return np.zeros((0, 0))
-    table = np.asarray(columns, dtype=float)
-    size = np.linalg.norm(table, axis=1)
-    u, sigma, _ = np.linalg.svd((table[size > 0] / size[size > 0, None]).T, full_matrices=False)
-    return u[:, sigma > 1e-10 * sigma.max(initial=0.0)]
-
-
-def least_squares(table: Float[np.ndarray, "R s"], values: Vector) -> Vector:
-    """Return coefficients (s,) of the columns that express values best, each taken as of size 1."""
-    size = np.linalg.norm(table, axis=0)
-    unit = 1 / np.where(size > 0, size, 1.0)
-    return unit * np.linalg.lstsq(table * unit, values, rcond=1e-10)[0]
+    """Return an orthonormal basis of columns, given one by one, each taken as of size 1."""
+    return span(np.asarray(columns, dtype=float).T) if len(columns) else np.zeros((0, 0))
 
 
 MOST_CANDIDATES = 3000
