@@ -210,6 +210,7 @@
   }
 
   const redraw = () => places.forEach(draw);
+  if (parent !== window) fillFrame();
   try {
     await unpack();
     for (const place of places) {
@@ -235,7 +236,6 @@
     addEventListener("hashchange", unfold);
     document.querySelectorAll("nav a").forEach((link) => link.addEventListener("click", () => setTimeout(unfold)));
     unfold();
-    if (parent !== window) fillFrame();
     dark.addEventListener("change", redraw);
     let waiting, width = innerWidth;
     addEventListener("resize", () => {
