@@ -395,3 +395,58 @@ def test_no_blocks_switch_cross_validation_off(compared, tmp_path):
     other.write_text(quick.replace(FAR, "") + "[validation]\nblocks = 0\n", encoding="utf-8")
     result = json.loads(run("fit", other, "--out", tmp_path / "fit", "--json").out)
     assert result["validation"] is None
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory):
+    """A fit to three experiments of one file, which a column numbers; each begins far from where one ended."""
+    folder = tmp_path_factory.mktemp("labelled")
+    rng = np.random.default_rng(8)
+    pieces = []
+    for start in (0.0, 5.0, 10.0):
+        u, y = rng.normal(size=60), np.full(60, start)
+        for k in range(1, 60):
+            y[k] = 0.9 * y[k - 1] + 0.3 * u[k - 1]
+        pieces.append((u, y + 1e-3 * rng.normal(size=60)))
+    u, y = map(np.concatenate, zip(*pieces, strict=True))
+    signals = {"u": u, "y": y, "experiment": np.repeat([1, 2, 3], 60)}
+    spec = project(folder, ALONE, **signals)
+    text = SPEC.replace("[data]\n", '[data]\nexperiment = "experiment"\n').split(
+        "[[baseline.terms]]"
+    )
+    spec.write_text(
+        "[[baseline.terms]]".join((text[0], text[1], text[3])) + ALONE, encoding="utf-8"
+    )
+    done = run("fit", spec, "--out", folder / "result")
+    assert done.code == 0, done.err
+    return folder, signals
+
+
+@pytest.mark.parametrize("lost", [None, 61, 119])
+def test_experiments_of_a_file_are_simulated_one_by_one(labelled, tmp_path, lost):
+    folder, signals = labelled
+    cells = {name: list(column) for name, column in signals.items()}
+    if lost is not None:
+        cells["y"][lost] = ""
+    write_csv(tmp_path / "new.csv", **cells)
+    options = [] if lost is None else ["--missing", "skip"]
+    done = run(
+        "simulate", folder / "result", tmp_path / "new.csv", "--out", tmp_path / "out.csv", *options
+    )
+    assert done.code == 0, done.err
+    rows = np.genfromtxt(tmp_path / "out.csv", delimiter=",", names=True)
+    assert len(rows) == 180
+    np.testing.assert_allclose(rows["time"], np.tile(0.1 * np.arange(60), 3), atol=1e-9)
+    without = np.flatnonzero(np.isnan(rows["y_model"])).tolist()
+    begins = [0, 60, 120]
+    assert without == {None: begins, 61: [0, 60, 61, 62, 120], 119: [0, 60, 119, 120]}[lost]
+    known = ~np.isnan(rows["y_model"])
+    np.testing.assert_allclose(rows["y_model"][known], signals["y"][known], atol=0.01)
+
+
+def test_a_file_without_the_column_of_experiments_is_one(labelled, tmp_path):
+    folder, signals = labelled
+    write_csv(tmp_path / "new.csv", u=signals["u"][:60], y=signals["y"][:60])
+    done = run("simulate", folder / "result", tmp_path / "new.csv", "--out", tmp_path / "out.csv")
+    assert done.code == 0 and "has no column 'experiment'" in unfolded(done.err)
+    assert "one experiment" in unfolded(done.err)

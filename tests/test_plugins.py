@@ -79,6 +79,11 @@ regressor = "u[k-1]"
 kind = "bumps"
 count = 7
 inputs = ["y[k-1]"]
+[training]
+restarts = 1
+iterations = 20
+[validation]
+blocks = 0
 """
 
 

@@ -196,6 +196,11 @@ def open_run(
         len(record) + record.missing,
         prepared_notes(loaded, record if reading.prepare else None),
     )
+    if loaded.experiment_column and not experiment_column(loaded, data):
+        notes += (
+            f"note: {data} has no column '{loaded.experiment_column}', which numbers the experiments "
+            "of the training data; its rows are taken as one experiment.",
+        )
     if record.missing:
         # A state to predict from
         estimated = need_outputs and loaded.form.states and not loaded.form.memory
@@ -226,9 +231,19 @@ def record_for(
         every=reading.every,
         columns=reading.columns,
         missing=reading.missing,
+        experiment=experiment_column(model, data),
         prepare=steps,
         uneven=model.form.steps_unevenly,
     )
+
+
+def experiment_column(model: Model, data: Path) -> str | None:
+    """Return the column that labels a file's experiments as those of the training data.
+
+    None where the file has no such column: its rows are one experiment.
+    """
+    named = model.experiment_column
+    return named if named and has_column(data, named) else None
 
 
 def check_instants(model: Model, data: Path) -> None:
@@ -449,16 +464,35 @@ def _table(response: Response, opened: ModelOnData) -> Any:
         return frames[0]
     import pandas as pd
 
+    begins = _first_rows(opened.record)
     placed = [
-        frame.set_axis(range(e.offset, e.offset + len(e)))
-        for frame, e in zip(frames, stretches, strict=True)
+        frame.set_axis(range(begin, begin + len(frame)))
+        for frame, begin in zip(frames, begins, strict=True)
     ]
     whole = pd.concat(placed).reindex(range(opened.rows))
-    first = stretches[0]
     if not opened.record.even:
         return whole  # the instants of rows that were left out are not known here
-    time = first.start_time + (np.arange(opened.rows) - first.offset) * response.sampling_time
-    return whole.assign(time=whole["time"].fillna(pd.Series(time)))
+    instants = pd.Series(np.nan, index=whole.index)
+    for begin, one in zip(begins, stretches, strict=True):
+        first = begin - one.offset  # of its recording
+        ahead = np.arange(first, opened.rows) - begin
+        instants[first:] = one.start_time + ahead * response.sampling_time
+    return whole.assign(time=whole["time"].fillna(instants))
+
+
+def _first_rows(record: Record) -> list[int]:
+    """Return the row of a file's table at which each experiment begins: recording by recording."""
+    experiments, recordings = record.experiments, record.recordings
+    found: list[int] = []
+    base = end = 0
+    for i, one in enumerate(experiments):
+        if i and recordings[i] != recordings[i - 1]:
+            apart = one.recording_row - experiments[i - 1].recording_row
+            rows = 0 if record.prepared else -(-apart // one.stride)
+            base = max(end, base + rows)
+        found.append(base + one.offset)
+        end = found[-1] + len(one)
+    return found
 
 
 def explain_notes(model: Path) -> list[str]:

@@ -125,6 +125,7 @@ class FrameSource:
     partitions: tuple[FramePartition, ...]
     client: Any
     time_column: str | None = None
+    experiment_column: str | None = None
 
     def window(self, start: int, stop: int) -> list[Experiment]:
         """Return rows `[start, stop)`, brought here."""
@@ -207,7 +208,14 @@ def open_frame(
         )
         for i, count in enumerate(counts)
     )
-    return FrameSource(groups[1], groups[0], check_step(sampling_time), partitions, client)
+    return FrameSource(
+        groups[1],
+        groups[0],
+        check_step(sampling_time),
+        partitions,
+        client,
+        experiment_column=experiment,
+    )
 
 
 def _tail(frame: Any) -> Any:

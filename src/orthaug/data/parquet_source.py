@@ -165,6 +165,7 @@ class ParquetSource:
     sampling_time: float
     time_column: str | None
     partitions: tuple[RowGroups, ...]
+    experiment_column: str | None = None
 
     @cached_property
     def _ends(self) -> Any:
@@ -254,7 +255,9 @@ def open_parquet(
                 f"{path}: sampled every {other:g} s, {steps[0][0]} every {step:g} s; resample "
                 "one of them."
             )
-    return ParquetSource(reading.inputs, reading.outputs, check_step(step), time, tuple(partitions))
+    return ParquetSource(
+        reading.inputs, reading.outputs, check_step(step), time, tuple(partitions), experiment
+    )
 
 
 def stamp_of(path: Path) -> Stamp:

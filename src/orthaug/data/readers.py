@@ -113,9 +113,8 @@ def read_record(
     ranges = _ranges(rows, total, path)
     ranges = ranges if experiment is None else _split_by_label(table, experiment, ranges)
     if prepare:
-        return _RawRanges(
-            table, channels, column_of, time, sampling_time or 1.0, every, missing
-        ).prepare(prepare, ranges)
+        raw = _RawRanges(table, channels, column_of, time, sampling_time or 1.0, every, missing)
+        return replace(raw.prepare(prepare, ranges), experiment_column=experiment)
     for begin, end in ranges:
         recorded += len(range(begin, end, every))
         for start, stop in _stretches(table, wanted, needed, begin, end, every, missing):
@@ -146,7 +145,14 @@ def read_record(
                     _check_rising(table, time, start, stop)
                     is_uneven = True
     if time and is_uneven:
-        record = Record(*map(tuple, channels), 1.0, tuple(experiments), time)  # type: ignore[arg-type]
+        record = Record(
+            tuple(channels[0]),
+            tuple(channels[1]),
+            1.0,
+            tuple(experiments),
+            time,
+            experiment_column=experiment,
+        )
         return _with_instants(record, table.columns[time], recorded)
     if time and not steps:
         raise InputError(
@@ -159,7 +165,15 @@ def read_record(
         raise InputError(f"{path}: column '{time}' {steps_text}.")
     left_out = recorded - sum(len(experiment) for experiment in experiments)
     step *= min(every, 10**15)  # what is longer is refused
-    return Record(tuple(channels[0]), tuple(channels[1]), step, tuple(experiments), time, left_out)
+    return Record(
+        tuple(channels[0]),
+        tuple(channels[1]),
+        step,
+        tuple(experiments),
+        time,
+        left_out,
+        experiment_column=experiment,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -181,6 +181,11 @@ class Experiment:
         shapes = f"inputs {np.shape(self.inputs)}, outputs {np.shape(self.outputs)}"
         return f"Experiment({visible(self.source) + ': ' if self.source else ''}{shapes})"
 
+    @property
+    def recording_row(self) -> int:
+        """The first row of the recording that this is a stretch of."""
+        return self.first_row - self.offset * self.stride
+
     def check(self, inputs: int, outputs: int) -> None:
         """Raise InputError unless the columns fit the channels, and both have as many rows."""
         wanted = (len(self), inputs), (len(self), outputs)
@@ -249,6 +254,8 @@ class Record(NotebookView):
     """
     prepared: tuple[Preparation, ...] = ()
     """Preparation of the samples, in order."""
+    experiment_column: str | None = None
+    """The column of the file that labels the experiments, where there is one."""
 
     def __post_init__(self) -> None:
         for name in ("inputs", "outputs"):
@@ -438,6 +445,7 @@ class Record(NotebookView):
                 before is not None
                 and before.source == one.source
                 and 0 <= before.offset < one.offset
+                and before.recording_row == one.recording_row
             )
             found.append((found[-1] if goes_on else found[-1] + 1) if found else 0)
         return tuple(found)

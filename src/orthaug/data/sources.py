@@ -62,6 +62,9 @@ class Source(Protocol):
     def time_column(self) -> str | None: ...
 
     @property
+    def experiment_column(self) -> str | None: ...
+
+    @property
     def partitions(self) -> Sequence[Partition]:
         """Partitions in order; experiments may begin in one and go on in the next."""
         ...
@@ -79,7 +82,12 @@ def rows_of(source: Source) -> int:
 def as_record(source: Source, experiments: Sequence[Experiment]) -> Record:
     """Return some of its rows as a record in memory."""
     return Record(
-        source.inputs, source.outputs, source.sampling_time, tuple(experiments), source.time_column
+        source.inputs,
+        source.outputs,
+        source.sampling_time,
+        tuple(experiments),
+        source.time_column,
+        experiment_column=source.experiment_column,
     )
 
 
@@ -197,6 +205,10 @@ class RecordSource:
     @property
     def time_column(self) -> str | None:
         return self.record.time_column
+
+    @property
+    def experiment_column(self) -> str | None:
+        return self.record.experiment_column
 
     @property
     def partitions(self) -> tuple[RowPartition, ...]:

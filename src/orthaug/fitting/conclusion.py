@@ -187,6 +187,7 @@ def _model_of(
         sampling_time=record.sampling_time,
         time_column=record.time_column,
         prepared=record.prepared,
+        experiment_column=record.experiment_column,
         structure=structure.name,
         largest_output=problem.largest_output,
         deviation=problem.deviation,

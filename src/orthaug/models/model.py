@@ -97,6 +97,8 @@ class Model(RecordModel[Form], NotebookView):
     """The model of the errors' colour, for predictions; None where nobody asked for one."""
     prepared: tuple[Preparation, ...] = field(default=(), kw_only=True, repr=False)
     """Preparation of the training data."""
+    experiment_column: str | None = field(default=None, kw_only=True, repr=False)
+    """The column that labelled the experiments of the training data; None where none did."""
     starts: Starts = field(default=PastOutputs(), kw_only=True, repr=False)  # noqa: RUF009
     """Origin of the state of a run."""
     trained: TrainedSegments | None = field(default=None, kw_only=True, repr=False)

@@ -160,6 +160,8 @@ def _declare(model: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     declared |= {"flown": kept.simulated, "verdict": kept.verdict}
     if model.prepared:
         declared["prepared"] = [asdict(step) for step in model.prepared]
+    if model.experiment_column:
+        declared["experiment_column"] = model.experiment_column
     declared |= of_form | {"learner": _declare_bound(form.bound)} | of_training
     arrays = {f"numbers.{name}": value for name, value in model.numbers._asdict().items()}
     arrays |= {
@@ -224,6 +226,7 @@ def _rebuild(
         deviation=arrays["deviation"] if "deviation" in arrays else 1 / arrays["weight"],
         weight=arrays["output_weight"] if "output_weight" in arrays else np.diag(arrays["weight"]),
         prepared=tuple(Preparation(**step) for step in declared.get("prepared", ())),
+        experiment_column=declared.get("experiment_column"),
         **kind.fields(declared, arrays, physics, bound),
     )
 
@@ -532,7 +535,7 @@ def check_loaded(model: Any, path: Path) -> None:
         raise InputError(
             f"{path}: its sampling time is {show(model.sampling_time)}; expected a positive number."
         )
-    for name in ("structure", "measure", "time_column"):
+    for name in ("structure", "measure", "time_column", "experiment_column"):
         if not isinstance(getattr(model, name), str | None):
             raise InputError(
                 f"{path}: its {name} is {show(getattr(model, name))}; expected a word."
