@@ -119,9 +119,17 @@ def is_determined(value: float, std: float, freedom: float, low: float, high: fl
 
 
 def undetermined_warning(
-    names: Sequence[str], candidates: Sequence[Candidate], remedies: Sequence[str]
+    names: Sequence[str],
+    candidates: Sequence[Candidate],
+    remedies: Sequence[str],
+    *,
+    entries: int,
 ) -> Warning:
-    """Return the warning on parameters that the hull leaves open, with reason and remedy."""
+    """Return the warning on parameters that the hull leaves open, with reason and remedy.
+
+    Args:
+        entries: inputs of the learner.
+    """
     shown = first_words(names, _LISTED)
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
@@ -131,7 +139,7 @@ def undetermined_warning(
         remedies
         or (
             "split under another measure",
-            "give the learner fewer inputs",
+            *(["give the learner fewer inputs"] if entries > 1 else []),
             "use an input designed for these parameters (`orthaug design`)",
         )
     )

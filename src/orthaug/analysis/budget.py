@@ -350,7 +350,8 @@ def budget_by(
     open_ones = [row.name for row in rows if not row.determined]
     if open_ones:
         cure = terms_of(found[0], terms).remedies(found[0].entries[0], open_ones)
-        warnings.append(undetermined_warning(open_ones, candidates, cure))
+        seen = len(terms.fit.model.form.entries)
+        warnings.append(undetermined_warning(open_ones, candidates, cure, entries=seen))
     entries = tuple(entry for causes in found for entry in causes.entries)
     return Budget(entries, found[0].share, parameters, physical, (*warnings, *unbounded))
 

@@ -198,8 +198,8 @@ def open_run(
     )
     if loaded.experiment_column and not experiment_column(loaded, data):
         notes += (
-            f"note: {data} has no column '{loaded.experiment_column}', which numbers the experiments "
-            "of the training data; its rows are taken as one experiment.",
+            f"note: {data} has no column '{loaded.experiment_column}', which numbers the "
+            "experiments of the training data; its rows are taken as one experiment.",
         )
     if record.missing:
         # A state to predict from
