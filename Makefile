@@ -3,7 +3,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test proofs fuzz check docs wheel smoke bench claims clean
+.PHONY: help setup demo test proofs long fuzz check docs wheel smoke bench claims clean
 
 BIN := .venv/bin
 STAMP := .venv/ready
@@ -25,7 +25,10 @@ test: $(STAMP)  ## run the test suite but for what takes long, a file at a time 
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 proofs: $(STAMP)  ## run the slow tests and proofs, which the suite leaves out, and print what these measured
-	@$(BIN)/python -m pytest -q -m "proof or slow" -n auto --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -m "(proof or slow) and not long" -n auto --dist loadfile --no-loadscope-reorder
+
+long: $(STAMP)  ## run the tests of 16 s or more, which CI leaves out, before a release
+	@$(BIN)/python -m pytest -q -m long -n auto --dist loadfile --no-loadscope-reorder
 
 fuzz: $(STAMP)  ## run 3,000 seeded hostile trials and print how many held, by area
 	@$(BIN)/python benchmarks/fuzz.py

@@ -70,10 +70,12 @@ golden golden_motion golden_examples app documents engines motion_fit report_bro
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, the others as they come; what takes long is marked."""
-    long = slow.listed()
+    listed = {name: slow.listed(name) for name in ("slow", "long")}
     for item in items:
         fixtures = {(item.path.stem, name) for name in getattr(item, "fixturenames", ())}
-        if item.nodeid in long or fixtures & slow.FIXTURES:
+        if item.nodeid in listed["long"] or fixtures & slow.LONG_FIXTURES:
+            item.add_marker("long")
+        elif item.nodeid in listed["slow"] or fixtures & slow.FIXTURES:
             item.add_marker("slow")
     place = {f"test_{name}": i for i, name in enumerate(_LONGEST.split())}
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
@@ -86,7 +88,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """What the proofs have measured, as the table of benchmarks/README.md."""
+    """What the proofs have measured, as the tables of benchmarks/README.md."""
     ended = [
         report
         for outcome in ("passed", "failed")
