@@ -425,9 +425,9 @@ def labelled(tmp_path_factory):
 @pytest.mark.parametrize("lost", [None, 61, 119])
 def test_experiments_of_a_file_are_simulated_one_by_one(labelled, tmp_path, lost):
     folder, signals = labelled
-    cells = {name: list(column) for name, column in signals.items()}
+    cells = {name: np.array(column, dtype=float) for name, column in signals.items()}
     if lost is not None:
-        cells["y"][lost] = ""
+        cells["y"][lost] = np.nan
     write_csv(tmp_path / "new.csv", **cells)
     options = [] if lost is None else ["--missing", "skip"]
     done = run(
