@@ -82,6 +82,8 @@ class ModelOnData:
     warnings: tuple[Warning, ...] = ()
     withheld: bool = False
     """True if its fit gave no standard errors, for a reason that other parameters share."""
+    first_row: int = 0
+    """Row of the file that the rows that were read begin at."""
 
 
 def read_rows(text: str | None) -> tuple[int, int] | None:
@@ -207,7 +209,8 @@ def open_run(
         first = loaded.form.first_row + ahead + bool(estimated)
         record, text = long_stretches(record, [0] * len(record.experiments), first)
         notes += (f"note: {data}: {text}",)
-    return ModelOnData(loaded, record, data, rows, notes)
+    begin = 0 if reading.rows is None else int(np.ravel(reading.rows)[0])
+    return ModelOnData(loaded, record, data, rows, notes, first_row=begin)
 
 
 def record_for(
@@ -464,7 +467,7 @@ def _table(response: Response, opened: ModelOnData) -> Any:
         return frames[0]
     import pandas as pd
 
-    begins = _first_rows(opened.record)
+    begins = _first_rows(opened.record, opened.first_row)
     placed = [
         frame.set_axis(range(begin, begin + len(frame)))
         for frame, begin in zip(frames, begins, strict=True)
@@ -480,16 +483,19 @@ def _table(response: Response, opened: ModelOnData) -> Any:
     return whole.assign(time=whole["time"].fillna(instants))
 
 
-def _first_rows(record: Record) -> list[int]:
-    """Return the row of a file's table at which each experiment begins: recording by recording."""
-    experiments, recordings = record.experiments, record.recordings
+def _first_rows(record: Record, first: int) -> list[int]:
+    """Return the row of a table at which each experiment begins: recording by recording.
+
+    Args:
+        first: the row of the file that the table begins at.
+    """
     found: list[int] = []
     base = end = 0
-    for i, one in enumerate(experiments):
-        if i and recordings[i] != recordings[i - 1]:
-            apart = one.recording_row - experiments[i - 1].recording_row
-            rows = 0 if record.prepared else -(-apart // one.stride)
-            base = max(end, base + rows)
+    before = -1
+    for one, recording in zip(record.experiments, record.recordings, strict=True):
+        if recording != before:
+            rows = 0 if record.prepared else -(-(one.recording_row - first) // one.stride)
+            base, first, before = max(end, base + rows), one.recording_row, recording
         found.append(base + one.offset)
         end = found[-1] + len(one)
     return found
