@@ -31,7 +31,7 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segmented_motion import SegmentedMotion
-from orthaug.fitting.segments import Segments, respond, sensitivity
+from orthaug.fitting.segments import Segments, respond, sensitivity, sensitivity_once
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
@@ -193,7 +193,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
         w = np.zeros(bound.size)
     form = replace(segmented.dynamics, motion=suspected, bound=bound)
     numbers = segmented.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
-    slopes = sensitivity(form, numbers, segmented.segments, place.states, place.weight)
+    slopes = sensitivity_once(form, numbers, segmented.segments, place.states, place.weight)
     objective = segmented.objective()
     rows = LOOSER * objective.start_rows
     information, gradient, _, slope = objective.initial.eliminate(slopes, place.states, rows)

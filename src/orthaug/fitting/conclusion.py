@@ -466,13 +466,12 @@ def _motion_model(
     )
     if not learned.ending.usable:
         return model
+    if model.learns:
+        model = replace(model, seen=_feature_range(model, plan.record))
+        model = _with_limits(model, plan.record)
     if plan.predictor is None and not briefly:  # a predictor forgets where it began
         model = _with_window(model, _best_window(model, plan.record))
-    return (
-        model
-        if not model.learns
-        else _with_limits(replace(model, seen=_feature_range(model, plan.record)), plan.record)
-    )
+    return model
 
 
 def _with_limits(model: Model[MotionDynamics], record: Record) -> Model[MotionDynamics]:

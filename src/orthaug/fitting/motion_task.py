@@ -1,9 +1,10 @@
 """Training of a motion on its free run: parameters, weights and initial states together.
 
-Physics alone is where every learner starts, and what it has to beat. It is trained over segments
-that lengthen: first the starts of short ones are found, then the parameters over them, then over
-longer ones, which begin at the states that the shorter ones went through. Every length may also
-begin anew from the initial parameters.
+Physics alone is where every learner starts, and what it has to beat. Where whole segments follow
+the outputs from the initial parameters, it is trained over them. Otherwise over segments that
+lengthen: first the starts of short ones are found, then the parameters over them, then over longer
+ones, which begin at the states that the shorter ones went through. Every length may also begin anew
+from the initial parameters.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from orthaug.fitting.field_points import sizes_learned
 from orthaug.fitting.initial_states import Start
 from orthaug.fitting.learned import ErrorStatistics, TrainedLearner
 from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.objective import FreeRunObjective, TrialPoint
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import MotionObjective, SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
@@ -117,10 +119,10 @@ def _descend_from_others(
                 best = other
     if best is None:
         return None
-    after = float(np.sqrt(_squared_errors(own, best) / own.residuals))
+    after = float(np.sqrt(_squares_at_end(own, best) / own.residuals))
     if declared is None:
         return best._replace(restarted=(None, after))
-    before = float(np.sqrt(_squared_errors(own, declared) / own.residuals))
+    before = float(np.sqrt(_squares_at_end(own, declared) / own.residuals))
     return best._replace(restarted=(before, after)) if after < before / 2 else declared
 
 
@@ -146,15 +148,14 @@ def descend_by_lengths(
 ) -> FreeRunFit | None:
     """Return the end of descents over ever longer segments, with what all of them spent.
 
-    Where that follows the outputs badly, a descent over whole segments from `initial` may end
-    lower. None where no run is finite.
+    Over whole segments at once where they follow the outputs from `initial`. Where the end of the
+    longer ones follows badly, a descent over whole segments from `initial` may end lower. None
+    where no run is finite.
     """
-    steps = own.segments.steps
-    lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
     ends: list[FreeRunFit] = []
     iterations, seconds = 0, 0.0
     q, rows = initial, None
-    for length in lengths:
+    for length in _lengths(own, initial):
         short = own.over(length)
         end = descend_from(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
         if end is None:
@@ -174,6 +175,20 @@ def descend_by_lengths(
         return None
     best = min(ends, key=lambda end: end.end.point.misfit)
     return best._replace(iterations=iterations, seconds=seconds)
+
+
+def _lengths(own: SegmentedMotion, initial: Vector) -> list[int]:
+    """Return the lengths of segments before whole ones.
+
+    None where those follow the outputs from `initial`: each length compiles its own programs.
+    """
+    steps = own.segments.steps
+    lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
+    if not lengths:
+        return []
+    objective, states = own.objective(), own.settle(initial, iterations=_SETTLING)
+    whole = objective.evaluate(initial, Start(states))
+    return [] if _follows_most(own, _squared_errors(own, objective, whole)) else lengths
 
 
 def descend_from(
@@ -204,16 +219,27 @@ def descend_from(
 
 
 def _follows(segmented: SegmentedMotion, free_fit: FreeRunFit) -> bool:
-    """Return whether the runs follow most of the outputs' variation."""
-    return bool(_squared_errors(segmented, free_fit) < _POOR**2 * segmented.residuals)
+    """Return whether the runs at the end of a fit follow most of the outputs' variation."""
+    return _follows_most(segmented, _squares_at_end(segmented, free_fit))
 
 
-def _squared_errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
-    """Return the sum of squared errors, each output in its deviation.
+def _follows_most(segmented: SegmentedMotion, squares: float) -> bool:
+    """Return whether runs with these squared errors follow most of the outputs' variation."""
+    return squares < _POOR**2 * segmented.residuals
+
+
+def _squares_at_end(segmented: SegmentedMotion, free_fit: FreeRunFit) -> float:
+    return _squared_errors(segmented, free_fit.objective, free_fit.end.point)
+
+
+def _squared_errors(
+    segmented: SegmentedMotion, objective: FreeRunObjective, point: TrialPoint
+) -> float:
+    """Return the sum of squared errors at a point, each output in its deviation.
 
     Infinite where they are too large to square.
     """
-    squares = free_fit.objective.squares(free_fit.end.point)
+    squares = objective.squares(point)
     return np.inf if squares is None else float(np.sum(np.diag(squares) / segmented.deviation**2))
 
 
@@ -255,7 +281,7 @@ def substep_shift(
     scored = np.asarray(segmented.segments.scored)[:, :, None]
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / segmented.deviation[:, None]
-        ratio = np.sqrt(np.sum(moved**2) / max(_squared_errors(segmented, free_fit), 1e-300))
+        ratio = np.sqrt(np.sum(moved**2) / max(_squares_at_end(segmented, free_fit), 1e-300))
     return float(ratio) if np.isfinite(ratio) else 0.0
 
 

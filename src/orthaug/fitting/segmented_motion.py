@@ -17,7 +17,7 @@ from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
-from orthaug.fitting.segments import Segments, begins_of, build_segments
+from orthaug.fitting.segments import Segments, begins_of, build_segments, few_lanes
 from orthaug.fitting.structures import Structure
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound, Scaling
@@ -130,7 +130,9 @@ class SegmentedMotion(SegmentedProblem):
         0 for whole experiments.
         """
         shape = None if self.like is None else self.like.over(segment).segments
-        segments = build_segments(self.record, self.dynamics, segment, 0, shape, self.shares)
+        lanes = few_lanes(segment) if segment else 1
+        made = (self.record, self.dynamics, segment, 0, shape, self.shares)
+        segments = build_segments(*made, lanes=lanes)
         return replace(
             self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
         )

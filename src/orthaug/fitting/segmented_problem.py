@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import AnyArray
+from orthaug._base.jax import AnyArray, padded_length
 from orthaug._base.progress import RunProgress, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
@@ -18,7 +18,7 @@ from orthaug.fitting.initial_states import Start
 from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, TrialPoint, errors_of
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, build_segments
+from orthaug.fitting.segments import SHORT, Segments, build_segments
 from orthaug.fitting.solvers.damped_step import MARQUARDT
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import noticeable_in
@@ -95,7 +95,10 @@ class Layout(NamedTuple):
         )
         if not (criterion.simulates and free_run.steps):
             return cls(segments, segments, None)
-        whole, colour = build_segments(record, dynamics, 0, free_run.washout, shapes[1]), None
+        # Many records share the program of their whole runs
+        rounded = padded_length(longest) if segments.steps < longest <= SHORT else 0
+        made = (record, dynamics, 0, free_run.washout, shapes[1])
+        whole, colour = build_segments(*made, longest=rounded), None
         if segments.steps < COLOURED_STEPS <= longest:
             first = tuple(e.rows(0, COLOUR_ROWS) for e in record.experiments)
             colour = build_segments(

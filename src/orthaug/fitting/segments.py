@@ -20,9 +20,10 @@ from orthaug.models.dynamics import AutodiffDynamics, Dynamics, Numbers
 from orthaug.models.rows import gram
 
 CHUNK = 256  # segments that run side by side
-_BLOCK = 1 << 15  # numbers: slopes that are known at once
+_BLOCK = 1 << 17  # numbers: slopes that are known at once
 _FEWEST = 8  # steps for which that pays
-_SHORT = 4096  # steps of all segments: a run takes milliseconds then, and to compile one a second
+SHORT = 4096  # steps of all segments: a run takes milliseconds then, and to compile one a second
+_LANES = 4  # segments side by side: fewer take as long, and have the same programs
 
 
 class Segments(NamedTuple):
@@ -55,10 +56,13 @@ def build_segments(
     washout: int,
     like: Segments | None = None,
     shares: int = 1,
+    longest: int = 0,
+    lanes: int = _LANES,
 ) -> Segments:
     """Return segments of `segment` steps; 0 for whole experiments.
 
-    The number of chunks is a multiple of `shares`.
+    The number of chunks is a multiple of `shares`. Small data are padded to `lanes` segments side
+    by side, where that costs little, and whole experiments to `longest` steps.
 
     With `like` they are padded to its shape where they are fewer or shorter, so that the same
     programs run over them.
@@ -67,7 +71,7 @@ def build_segments(
     row is scored once, except the first `washout` of each experiment.
     """
     usable = [len(experiment) - dynamics.first_row for experiment in record.experiments]
-    longest = max(*usable, 0 if like is None else like.steps)
+    longest = max(*usable, longest, 0 if like is None else like.steps)
     steps = min(segment, longest) if segment else longest
     washout = min(washout, steps - 1)
     pieces = []
@@ -80,10 +84,10 @@ def build_segments(
     count = len(pieces)
     chunks = -(-count // (CHUNK * shares)) * shares
     width = -(-count // chunks)
-    if width > 8:  # about as many segments run by the same program
+    if steps * max(width, lanes) <= SHORT and width <= max(8, lanes):
+        width = max(lanes, 1 << (width - 1).bit_length())  # others beside them cost nothing
+    elif width > 8:  # about as many segments run by the same program
         width += -width % 8
-    elif steps * width <= _SHORT:  # where others beside them cost nothing
-        width = max(2, 1 << (width - 1).bit_length())
     if like is not None and chunks * width <= like.scored.shape[0] * like.scored.shape[2]:
         chunks, width = like.scored.shape[0], like.scored.shape[2]
     nothing = Segments(*(np.zeros_like(part) for part in pieces[0]))
@@ -91,6 +95,11 @@ def build_segments(
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))
     cut = (np.moveaxis(part.reshape(*part.shape[:-1], chunks, width), -2, 0) for part in stacked)
     return Segments(*map(jax.device_put, cut))
+
+
+def few_lanes(steps: int) -> int:
+    """Return how many short segments always run side by side: records share their programs."""
+    return max(_LANES, 1 << max(SHORT // steps, 1).bit_length() - 1)
 
 
 def begins_of(rows: int, steps: int, washout: int) -> list[int]:
@@ -171,6 +180,10 @@ def sensitivity(
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
 
 
+# For one call: compiled in a quarter of the time
+sensitivity_once = quick_jit(sensitivity.__wrapped__, static_argnames="dynamics")
+
+
 def chunk_sensitivity(
     dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any
 ) -> Sensitivity:
@@ -203,19 +216,46 @@ def _columns(scored: Array, slope: Array, error: Array, weight: Array) -> Array:
 def _step_by_step(
     dynamics: Dynamics, numbers: Numbers, carry: Any, rows: Any, weight: Array
 ) -> tuple[Any, Any]:
-    """Return Gram matrices of one chunk, for dynamics that can carry derivatives."""
-    n0 = dynamics.states
+    """Return Gram matrices of one chunk, for dynamics that can carry derivatives.
 
-    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, None]:
-        state, slopes, shared, own = carry
+    The columns of a block of steps are multiplied at once.
+    """
+    n0, width = dynamics.states, carry[0].shape[-1]
+    size = _BLOCK // (width * len(dynamics.outputs) * (n0 + dynamics.unknowns + 1))
+
+    def step(carry: tuple[Any, ...], row: tuple[Any, ...]) -> tuple[Any, Any]:
+        state, slopes = carry
         inputs, target, scored = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
-        columns = _columns(scored, slope, target - value, weight)
-        shared = shared + sum(gram(output[n0:]) for output in columns)
-        own = own + sum(output[:n0, None] * output[None] for output in columns)
-        return (state, slopes, shared, own), None
+        return (state, slopes), _columns(scored, slope, target - value, weight)
 
-    return jax.lax.scan(step, carry, tuple(rows))[0][2:]
+    def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
+        *running, shared, own = carry
+        running, columns = jax.lax.scan(step, tuple(running), rows)
+        columns = jnp.moveaxis(columns, 0, -2)  # (ny, n0 + n + 1, size, width)
+        shared, own = _with_sums(shared, own, columns, n0)
+        return (*running, shared, own), None
+
+    return jax.lax.scan(block, carry, _cut(rows, max(size, 1)))[0][2:]
+
+
+def _with_sums(shared: Array, own: Array, columns: Array, n0: int) -> tuple[Array, Array]:
+    """Return the Gram matrices with columns (ny, n0 + n + 1, steps, width) of further steps."""
+    for output in columns:
+        shared = shared + gram(output[n0:].reshape(len(shared), -1))
+        own = own + (output[:n0, None] * output[None]).sum(axis=-2)
+    return shared, own
+
+
+def _cut(rows: Any, most: int) -> tuple[Array, ...]:
+    """Return rows (T, …) in blocks of at most so many steps, the last one padded with zeros."""
+    steps = len(rows[0])
+    count = -(-steps // most)
+    size = -(-steps // count)
+    padded = (
+        jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows
+    )
+    return tuple(part.reshape(count, size, *part.shape[1:]) for part in padded)
 
 
 def _steps_at_once(
@@ -228,15 +268,13 @@ def _steps_at_once(
     Only the product of the slopes has to go from step to step. A block is bounded, so nothing has
     the size of the data.
     """
-    n0, width = dynamics.states, carry[0].shape[-1]
-    n, steps = dynamics.unknowns, len(rows[0])
-    count = -(-steps // most)
-    size = -(-steps // count)
+    n0, n, width = dynamics.states, dynamics.unknowns, carry[0].shape[-1]
     side_by_side = jax.vmap(lambda state, row: dynamics.step(numbers, state, row)[0], -1, -1)
 
     def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
         state, slopes, shared, own = carry
         inputs, target, scored = rows
+        size = len(inputs)
         state, states = jax.lax.scan(
             lambda state, row: (side_by_side(state, row), state), state, inputs
         )
@@ -255,15 +293,9 @@ def _steps_at_once(
         before = jnp.moveaxis(before, 0, -2)  # (n0, n0 + n, size, width)
         slope = sum(to_state[n0:, i, None] * before[None, i] for i in range(n0)) + own_slopes[n0:]
         columns = _columns(scored, slope, jnp.moveaxis(target, 0, -2) - value[n0:], weight)
-        shared = shared + sum(gram(output[n0:].reshape(n + 1, -1)) for output in columns)
-        own = own + sum((output[:n0, None] * output[None]).sum(axis=-2) for output in columns)
-        return (state, slopes, shared, own), None
+        return (state, slopes, *_with_sums(shared, own, columns, n0)), None
 
-    rows = [
-        jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows
-    ]
-    cut = tuple(part.reshape(count, size, *part.shape[1:]) for part in rows)
-    return jax.lax.scan(block, carry, cut)[0][2:]
+    return jax.lax.scan(block, carry, _cut(rows, most))[0][2:]
 
 
 def _flatten(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:

@@ -178,8 +178,23 @@ class MLP:
 
     def apply(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         for weight, bias, activation in self.layers(tree):
+            z = ACTIVATIONS[activation](_few_rows_product(weight, z) + bias)
+        return z
+
+    def apply_to_many(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """Return `apply` for one of the thousands of rows that are mapped, by matrix products."""
+        for weight, bias, activation in self.layers(tree):
             z = ACTIVATIONS[activation](weight @ z + bias)
         return z
+
+
+def _few_rows_product(weight: Any, z: Any) -> Any:
+    """Return `weight @ z` as sums of products, which become part of the step that needs them.
+
+    A matrix product is a call of its own, and takes ten times as long as the few numbers of runs
+    side by side (benchmarks/small_products.py).
+    """
+    return jnp.sum(weight * z, axis=1)
 
 
 def _uniform(key: Array, reach: Vector, count: int) -> AnyArray:
@@ -480,6 +495,11 @@ class Bound:
         """Return f(z; w) for one row, of the weight arrays."""
         return self.learner.apply(self.tree(leaves), z)
 
+    def one_of_many(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+        """Return `from_leaves` where thousands of rows are mapped side by side."""
+        apply = getattr(self.learner, "apply_to_many", self.learner.apply)
+        return apply(self.tree(leaves), z)
+
     def tree(self, leaves: list[Any]) -> Tree:
         """Return the learner's own weights, of the weight arrays."""
         return jax.tree.unflatten(self._shape[0], leaves)
@@ -494,7 +514,7 @@ class Bound:
         """
 
         def one_row(leaves: list[Any], z_row: Array, gain_row: Array) -> tuple[Any, list[Any]]:
-            value, pullback = jax.vjp(lambda tree: self.from_leaves(tree, z_row), leaves)
+            value, pullback = jax.vjp(lambda tree: self.one_of_many(tree, z_row), leaves)
             scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
             return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]
 

@@ -412,7 +412,8 @@ def row_values(
     bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]
 ) -> Float[Array, "k ny m"]:
     """Return f at every row, in the learner's unit."""
-    one_chunk = jax.vmap(lambda row: bound.values(w, row), in_axes=-1, out_axes=-1)
+    leaves = bound.leaves(w)
+    one_chunk = jax.vmap(lambda row: bound.one_of_many(leaves, row), in_axes=-1, out_axes=-1)
     return jax.lax.map(one_chunk, z)
 
 
@@ -423,7 +424,8 @@ def _values(bound: Bound, chunk: Chunk, w: Array, tilt: Array | None) -> Float[A
     """
 
     def member_values(w: Array) -> Array:
-        values = jax.vmap(lambda z: bound.values(w, z), in_axes=-1, out_axes=-1)(chunk.z)
+        leaves = bound.leaves(w)
+        values = jax.vmap(lambda z: bound.one_of_many(leaves, z), in_axes=-1, out_axes=-1)(chunk.z)
         return chunk.learned(values)
 
     if tilt is None:
