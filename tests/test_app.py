@@ -35,6 +35,7 @@ from orthaug.commands.app.session import Session, Sessions
 from orthaug.commands.app.worker import thin_curve
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
+from orthaug.commands.signals import WATCH
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -390,10 +391,19 @@ def test_lines_of_progress_name_the_stages_after_the_runs(monkeypatch, capsys):
     lines = capsys.readouterr().err.splitlines()
     stages = [json.loads(line)["stage"] for line in lines if line.startswith("{")]
     assert stages == ["scores", "report"]
-    command = Command(["fit"], lambda: None)
-    for stage in (Stage.SCORES, Stage.ADVICE, Stage.SCORES):  # the last one is of a trial
-        command._enter(stage)
-    assert command.stage is Stage.ADVICE
+    assert Stage.SCORES.after(None) is Stage.SCORES
+    assert Stage.ADVICE.after(Stage.SCORES) is Stage.ADVICE
+    assert Stage.SCORES.after(Stage.ADVICE) is Stage.ADVICE  # of a trial
+
+
+def test_an_early_end_names_the_stage_after_the_runs():
+    with training_bar(2, 10) as progress:
+        progress(1, 3, 0.5)
+        assert WATCH._during() == "run 2 of 2, iteration 3, loss 0.5"
+        Stage.ADVICE.enter()
+        Stage.SCORES.enter()  # of a trial
+        assert WATCH._during() == "trials of advice"
+    assert WATCH._during() == ""
 
 
 def test_a_proposal_is_no_spec_yet(tmp_path):

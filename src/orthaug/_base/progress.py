@@ -28,6 +28,14 @@ class Stage(StrEnum):
     FIGURES = "figures"
     REPORT = "report"
 
+    def after(self, reached: Stage | None) -> Stage:
+        """Return this stage, or the one that was reached if that is later.
+
+        A trial of advice comes to earlier stages again, which are part of it.
+        """
+        order = list(Stage)
+        return self if reached is None or order.index(self) > order.index(reached) else reached
+
     def enter(self) -> None:
         """Log that a fit has come to this stage."""
         _STAGE_LOG.info("%s", self.value)
@@ -53,17 +61,25 @@ def show_model(name: str, fit: Callable[[], Any], record: Any) -> None:
 
 
 def follow_training(
-    show_stage: Callable[[str], None], show_fit: Callable[[str, Any, Any], None]
+    show_stage: Callable[[str], None], show_fit: Callable[[str, Any, Any], None] | None = None
 ) -> None:
-    """Call functions with every stage, and every model with its record, of fits of this process."""
-    for log, show in (
-        (_STAGE_LOG, lambda record: show_stage(record.getMessage())),
-        (_MODEL_LOG, lambda record: show_fit(record.getMessage(), record.fit, record.record)),
-    ):
-        handler = logging.Handler()
-        handler.emit = show  # pyright: ignore[reportAttributeAccessIssue]
-        log.handlers[:] = [handler]
-        log.setLevel(logging.INFO)
+    """Call functions with every stage, and every model with its record, of fits of this process.
+
+    Models are made for this only; without `show_fit` they are not.
+    """
+    stop_following()
+    _call_for_records(_STAGE_LOG, lambda record: show_stage(record.getMessage()))
+    if show_fit is not None:
+        _call_for_records(
+            _MODEL_LOG, lambda record: show_fit(record.getMessage(), record.fit, record.record)
+        )
+
+
+def _call_for_records(log: logging.Logger, show: Callable[[Any], None]) -> None:
+    handler = logging.Handler()
+    handler.emit = show  # pyright: ignore[reportAttributeAccessIssue]
+    log.handlers[:] = [handler]
+    log.setLevel(logging.INFO)
 
 
 def stop_following() -> None:

@@ -20,6 +20,7 @@ from orthaug._base.progress import (
     Plan,
     Progress,
     ProgressCallback,
+    Stage,
     StopTraining,
     follow_training,
     stop_following,
@@ -94,6 +95,7 @@ def training_bar(
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
         line = _Lines(runs, iterations)
+        stage: Stage | None = None
 
         def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
@@ -112,12 +114,25 @@ def training_bar(
             if ENOUGH.is_set():
                 raise StopTraining
 
+        def enter(name: str) -> None:
+            nonlocal reached, stage
+            line.enter(name)
+            stage = Stage(name).after(stage)
+            reached = stage.value
+            bar.update(task, description=reached, total=None)
+
+        follow_training(enter, _tell_model if line.wanted else None)
         try:
             yield Progress(show, plan=line.planned)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
+        finally:
+            if line.wanted:  # the result is written after the bar has ended
+                follow_training(line.enter, _tell_model)
+            else:
+                stop_following()
         if interrupted.is_set():
-            raise KeyboardInterrupt("the scoring of the model")
+            raise KeyboardInterrupt(reached)
 
 
 class _Lines:
@@ -128,19 +143,20 @@ class _Lines:
 
     def __init__(self, runs: int, iterations: int) -> None:
         self.runs, self.iterations = runs, iterations
-        self._wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
+        self.wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
-        if self._wanted:
-            follow_training(lambda stage: streams.say(json.dumps({"stage": stage})), _tell_model)
-        else:  # an earlier command of this process may have been followed
-            stop_following()
+
+    def enter(self, stage: str) -> None:
+        """Write that the fit has come to a stage."""
+        if self.wanted:
+            streams.say(json.dumps({"stage": stage}))
 
     def planned(self, first: int, plan: Plan) -> None:
         """Set the runs that follow from this number on."""
         self._first, self._plan = first, tuple(plan)
 
     def __call__(self, run: int, iteration: int, loss: float, passes: int) -> None:
-        if not self._wanted or time.monotonic() - self._last < _OFTEN:
+        if not self.wanted or time.monotonic() - self._last < _OFTEN:
             return
         self._last = time.monotonic()
         fields = {

@@ -116,7 +116,8 @@ def fit(
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, job.problem.count
-    with training_bar(job.run_count, job.iterations, learns, rows) as progress:
+    takes_a_while = learns or job.spec.motion is not None
+    with training_bar(job.run_count, job.iterations, takes_a_while, rows) as progress:
         fitted = fit_job(job, progress)
     if other_writes():
         return

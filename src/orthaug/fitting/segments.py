@@ -268,7 +268,7 @@ def _steps_at_once(
     Only the product of the slopes has to go from step to step. A block is bounded, so nothing has
     the size of the data.
     """
-    n0, n, width = dynamics.states, dynamics.unknowns, carry[0].shape[-1]
+    n0, width = dynamics.states, carry[0].shape[-1]
     side_by_side = jax.vmap(lambda state, row: dynamics.step(numbers, state, row)[0], -1, -1)
 
     def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:

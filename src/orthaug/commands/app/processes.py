@@ -117,7 +117,7 @@ class Command:
             if message is None:
                 self.lines = [*self.lines, line][-_LINES:]
             elif "stage" in message:
-                self._enter(Stage(message["stage"]))
+                self.stage = Stage(message["stage"]).after(self.stage)
             elif "model" in message:
                 if self.stage is None:  # else it is of a trial
                     self.models.pop(message["model"], None)
@@ -127,12 +127,6 @@ class Command:
                 self.losses.append((Run.of(message), message["iteration"], message["loss"]))
             self.changed()
         return await self.process.wait()
-
-    def _enter(self, stage: Stage) -> None:
-        """Go on to a stage; a trial of advice comes to earlier ones again, which are part of it."""
-        order = list(Stage)
-        if self.stage is None or order.index(stage) > order.index(self.stage):
-            self.stage = stage
 
     def stop(self) -> None:
         """Interrupt the command: it keeps or removes partial files, and ends."""
