@@ -328,6 +328,50 @@ def test_a_product_of_state_and_input_is_tried_as_missing_physics():
     assert best.coefficient == pytest.approx(-4, rel=0.2)
 
 
+@pytest.mark.parametrize(
+    ("variable", "size", "amplitude", "acceleration"),
+    [
+        ("u", 1.0, 1.2, lambda x, v, u: (np.clip(u, -1, 1) - 0.4 * v - 4 * x) / 0.8),
+        (
+            "x",
+            0.5,
+            3.0,
+            lambda x, v, u: (u - 0.4 * v - 4 * x - 8 * (x - np.clip(x, -0.5, 0.5))) / 0.8,
+        ),
+    ],
+    ids=["saturation", "end stop"],
+)
+def test_a_term_that_begins_beyond_a_size_is_named_with_that_size(
+    variable, size, amplitude, acceleration
+):
+    """A saturating actuator was called odd and growing, "as a hardening spring": -0.1*u**3 at 81 %."""
+    draw = np.random.default_rng(11)
+    held = np.repeat(amplitude * draw.normal(size=60), 10)
+    x, v, out, fine = 0.0, 0.0, [], 40
+    for u in held:
+        out.append(x)
+        for _ in range(fine):
+            v += 0.05 / fine * acceleration(x, v, u)
+            x += 0.05 / fine * v
+    y = np.array(out) + 0.002 * draw.normal(size=len(out))
+    record = oa.Record.from_arrays(held, y, sampling_time=0.05)
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - c*v - k*x)/m", start="derivative of y"),
+        ],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter(name, at, min=0) for name, at in (("m", 1), ("c", 0.5), ("k", 3))],
+        ["u"],
+        hold="zero-order",
+    )
+    found = missing_terms(oa.estimate(record, motion, learner=None))
+    best = found.terms[0]
+    assert (best.equation, best.variable, best.shape) == ("v", variable, "beyond")
+    assert best.width == pytest.approx(size, rel=0.15) and best.share > 0.8
+    assert best.coefficient < 0 and f"that begins at about |{variable}| = " in str(best)
+
+
 def test_a_mode_that_the_integrator_distorts_is_no_other_solution():
     """A fast mode far below a step is right under long steps alone: no warning names it."""
     u, x, wall, y = stepped(1200, 9, held=6), 0.0, 0.0, []

@@ -149,6 +149,8 @@ class MissingTermResult(Content):
     coefficient: Number
     share: Number
     expression: str
+    term: str = "1"
+    """The expression without its coefficient."""
     variables: list[str] = []
     """The states and inputs that it depends on."""
 

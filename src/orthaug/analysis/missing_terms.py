@@ -184,7 +184,7 @@ def _propagate(
 
 SHAPES = ("linear", "jump", "absolute", "square", "cube")
 _EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
-_EXPRESSIONS = ("{}", "sign({})", "|{}|", "{}**2", "{}**3")
+_TERMS = ("{}", "sign({})", "abs({})", "{}**2", "{}**3")
 _MEANINGS = (
     "linear in {}",
     "odd in {} with a jump at 0, as dry friction",
@@ -193,6 +193,9 @@ _MEANINGS = (
     "odd in {} and growing faster than it, as a hardening spring",
 )
 _ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
+BEYOND = "beyond"  # the shape of a term that is zero up to a width, as past the ends of a gap
+# Shares of a variable's size, by quantiles: the widths that are tried, and those for the best one
+_WIDTHS, _FINER = (0.5, 0.8), tuple(np.linspace(0.1, 0.95, 18).tolist())
 # Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
 _OWN = 0.02
 _RANK = 1e-6  # of the largest singular value of such columns, each of size 1
@@ -224,6 +227,8 @@ class MissingTerm:
     """True if the variable keeps its sign over the data: nothing is then known of odd and even."""
     factors: tuple[str, ...] = ()
     """Of a product, its variables; `variable` is then the product itself, linear in it the term."""
+    width: float | None = None
+    """Of a term that begins beyond a size of its variable, that size."""
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -231,17 +236,28 @@ class MissingTerm:
         return self.factors or (() if self.variable is None else (self.variable,))
 
     @property
+    def term(self) -> str:
+        """The term without its coefficient, as an expression."""
+        if self.variable is None:
+            return "1"
+        if self.width is None:
+            return _TERMS[SHAPES.index(self.shape)].format(self.variable)
+        size = f"{self.width:.4g}"
+        return f"(max({self.variable} - {size}, 0) + min({self.variable} + {size}, 0))"
+
+    @property
     def expression(self) -> str:
         """The term in the equation's own names."""
         if self.variable is None:
             return f"{self.coefficient:.3g}"
-        return (
-            f"{self.coefficient:.3g}*{_EXPRESSIONS[SHAPES.index(self.shape)].format(self.variable)}"
-        )
+        return f"{self.coefficient:.3g}*{self.term}"
 
     @property
     def meaning(self) -> str:
         """Its kind in words."""
+        if self.width is not None:
+            place = f"about |{self.variable}| = {self.width:.3g}"
+            return f"that begins at {place}, as a saturation, an end stop or a gap"
         words = _ONE_SIDED if self.one_sided else _MEANINGS
         return (
             "constant"
@@ -292,52 +308,137 @@ class _Regression(NamedTuple):
     left: int
 
 
+Product = tuple[int, int, int, int]
+"""Two variables and their powers."""
+
+
+class _Tried(NamedTuple):
+    """The terms that are tried in each equation, and what makes them of the points.
+
+    A constant and the shapes of each variable are the simple ones; products and terms that begin
+    beyond a size of a variable follow.
+    """
+
+    names: tuple[str, ...]
+    choice: Matrix
+    """Rows (n, nx + nu) of the variables by states and inputs."""
+    products: list[Product]
+    beyond: tuple[float, ...]
+    """Shares of a variable's size that are the widths."""
+
+    @property
+    def simple(self) -> int:
+        """Number of simple terms."""
+        return 1 + len(SHAPES) * len(self.names)
+
+    @property
+    def count(self) -> int:
+        """Number of all terms."""
+        return self.simple + len(self.products) + len(self.beyond) * len(self.names)
+
+
+class _Sizes(NamedTuple):
+    """What is known of the variables along the runs."""
+
+    largest: Vector
+    one_sided: list[bool]
+    """True for those that keep their sign."""
+    widths: Matrix
+    """Widths (w, n) in units of the largest size."""
+
+    @classmethod
+    def of(cls, values: Matrix, shares: tuple[float, ...]) -> _Sizes:
+        """Return the sizes of variables (n, M)."""
+        size = np.abs(values)
+        largest = size.max(axis=1, initial=0.0)
+        largest = np.where(largest > 0, largest, 1.0)
+        widths = np.quantile(size / largest[:, None], shares, axis=1)
+        return cls(largest, [not changes_sign(one) for one in values], widths)
+
+
 def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
     A difference that the equations contain, such as the stroke of a spring between two masses, is
-    a variable, too. Products of two states or inputs are tried where rows are many. None where the
-    runs have no slopes, or there are too few rows.
+    a variable, too. Where rows are many, products of two states or inputs are tried as well, and
+    terms that begin beyond a size of one. None where the runs have no slopes, or there are too few
+    rows.
     """
     motion = fit.problem.motion
     if not fit.segmented.dynamics.differentiable:
         return None
-    names, choice = _variables(motion)
     equations = doubted_equations(fit)
     rows = fit.segmented.segments.count * len(motion.outputs)
-    products = _products(motion.visible)
-    count = 1 + len(SHAPES) * len(names)
-    if rows < _ROWS_PER_PRODUCT * (count + len(products)) * len(equations):
-        products = []
-    count += len(products)
-    found_of: list[tuple[Vector, list[bool]]] = []
+    tried = _Tried(*_variables(motion), _products(motion.visible), _WIDTHS)
+    if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
+        tried = tried._replace(products=[], beyond=())
+    sizes: list[_Sizes] = []
 
     def terms(points: Matrix) -> Terms:
-        own = choice @ points
-        size = np.abs(own).max(axis=1, initial=0.0)
-        size = np.where(size > 0, size, 1.0)
-        found_of.append((size, [not changes_sign(values) for values in own]))
-        return lambda rows: _values(choice @ rows / size[:, None], found_of[0][1], products)
+        sizes.append(_Sizes.of(tried.choice @ points, tried.beyond))
+        return lambda rows: _values(tried, sizes[0], rows)
 
-    found = sensitivities(fit, equations, terms, count)
+    found = sensitivities(fit, equations, terms, tried.count)
     if found is None:
         return None
     tested = _joint_test(found)
     if tested is None:
         return None
     p, freedom, share, gains, shares, coefficients = tested
-    if products:
-        # Simple terms are tested by themselves, too: products would take power from them
-        by_term = np.arange(len(gains)) % count < count - len(products)
+    if tried.count > tried.simple:
+        # Simple terms are tested by themselves, too: the others would take power from them
+        by_term = np.arange(len(gains)) % tried.count < tried.simple
         alone = _joint_test(found.with_terms(by_term))
         if alone is not None and alone[0] < p:
             p, freedom, share = alone[:3]
         p = min(2 * p, 1.0)
         gains = np.where(by_term, gains, _RIVAL * gains)
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
-    made = (motion, equations, names, products)
-    listed = [_term(*made, j, coefficients, shares, *found_of[0]) for j in order]
+    listed = []
+    for j in order:
+        place, number = divmod(j, tried.count)
+        equation = motion.names_of_states[equations[place]]
+        made = (equation, number, float(coefficients[j]), float(shares[j]))
+        listed.append(_term(tried, sizes[0], *made))
+    for j, term in zip(order, listed, strict=True):
+        if term.width is not None:
+            best = _finer(fit, tried, equations[j // tried.count], term)
+            listed = _with_finer(listed, best)
+            break
     return MissingTest(p, freedom, share, tuple(listed))
+
+
+def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTerm]:
+    """Return the terms with that of the best width, in front where it leaves clearly less.
+
+    It has a width more than the others, and is named once.
+    """
+    same = (best.equation, best.variable, BEYOND)
+    others = [one for one in listed if (one.equation, one.variable, one.shape) != same]
+    if not others or 1 - best.share < _RIVAL * (1 - others[0].share):
+        return [best, *(one for one in others if one.share > _RIVAL * best.share)]
+    return [others[0], best, *others[1:]]
+
+
+def _finer(fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm) -> MissingTerm:
+    """Return a term that begins beyond a size, with the best of many sizes."""
+    i = tried.names.index(str(term.variable))
+    one = _Tried((tried.names[i],), tried.choice[i : i + 1], [], _FINER)
+    sizes: list[_Sizes] = []
+
+    def terms(points: Matrix) -> Terms:
+        sizes.append(_Sizes.of(one.choice @ points, _FINER))
+        return lambda rows: _values(one, sizes[0], rows)[one.simple :]
+
+    found = sensitivities(fit, [equation], terms, len(_FINER))
+    tested = None if found is None else _joint_test(found)
+    if tested is None:
+        return term
+    *_, gains, shares, coefficients = tested
+    j = int(np.argmax(gains))
+    made = (term.equation, one.simple + j, float(coefficients[j]), float(shares[j]))
+    best = _term(one, sizes[0], *made)
+    return best if best.share > term.share else term
 
 
 def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
@@ -352,10 +453,6 @@ def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
     rows = [unit[every.index(name)] for name in names]
     rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
     return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
-
-
-Product = tuple[int, int, int, int]
-"""Two variables and their powers."""
 
 
 def _products(names: tuple[str, ...]) -> list[Product]:
@@ -388,53 +485,52 @@ def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:
     return tuple(sorted(moved)) or tuple(range(len(motion.states)))
 
 
-def _values(z: Matrix, one_sided: list[bool], products: list[Product]) -> Any:
-    """Return a constant, the shapes of each variable, products: (1 + 5 n + m, r) of z (n, r).
+def _values(tried: _Tried, sizes: _Sizes, rows: Matrix) -> Any:
+    """Return the terms (count, r) of states and inputs (nx + nu, r).
 
     Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
     their places.
     """
+    z = tried.choice @ rows / sizes.largest[:, None]
     shaped = [
         [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
-        for one, both in zip(z, np.logical_not(one_sided), strict=True)
+        for one, both in zip(z, np.logical_not(sizes.one_sided), strict=True)
     ]
-    multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in products]
-    each = (values for own in shaped for values in own)
-    return np.stack([np.ones(z.shape[1]), *each, *multiplied])
+    multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in tried.products]
+    beyond = [z - np.clip(z, -w[:, None], w[:, None]) for w in sizes.widths]
+    each = (values for own in (*shaped, *beyond) for values in own)
+    simple = list(itertools.islice(each, tried.simple - 1))
+    return np.stack([np.ones(z.shape[1]), *simple, *multiplied, *each])
 
 
 def _term(
-    motion: Motion,
-    equations: tuple[int, ...],
-    names: tuple[str, ...],
-    products: list[Product],
-    j: int,
-    coefficients: Vector,
-    shares: Vector,
-    sizes: Vector,
-    one_sided: list[bool],
+    tried: _Tried, sizes: _Sizes, equation: str, number: int, coefficient: float, share: float
 ) -> MissingTerm:
-    simple = 1 + len(SHAPES) * len(names)
-    count = simple + len(products)
-    equation, number = motion.names_of_states[equations[j // count]], j % count
-    coefficient, share = float(coefficients[j]), float(shares[j])
+    """Return the term of a number among those that are tried."""
+    names, largest = tried.names, sizes.largest
     if number == 0:
         return MissingTerm(equation, None, "constant", coefficient, share)
-    if number >= simple:
-        first, second, a, b = products[number - simple]
-        coefficient /= float(sizes[first] ** a * sizes[second] ** b)
+    if number < tried.simple:
+        variable, shape = divmod(number - 1, len(SHAPES))
+        power = (1, 0, 1, 2, 3)[shape]
+        coefficient /= float(largest[variable]) ** power
+        one_sided = sizes.one_sided[variable]
+        return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided)
+    number -= tried.simple
+    if number < len(tried.products):
+        first, second, a, b = tried.products[number]
+        coefficient /= float(largest[first] ** a * largest[second] ** b)
         factors = (names[first], names[second])
         product = "*".join(
             name if power == 1 else f"{name}**{power}"
             for name, power in zip(factors, (a, b), strict=True)
         )
         return MissingTerm(equation, product, "linear", coefficient, share, factors=factors)
-    variable, shape = divmod(number - 1, len(SHAPES))
-    power = (1, 0, 1, 2, 3)[shape]
-    coefficient /= float(sizes[variable]) ** power
-    return MissingTerm(
-        equation, names[variable], SHAPES[shape], coefficient, share, one_sided[variable]
-    )
+    level, variable = divmod(number - len(tried.products), len(names))
+    size = float(largest[variable])
+    width = size * float(sizes.widths[level, variable])
+    made = (equation, names[variable], BEYOND, coefficient / size, share)
+    return MissingTerm(*made, sizes.one_sided[variable], width=width)
 
 
 def _joint_test(

@@ -27,13 +27,6 @@ from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.reports.result import FitResult
 
-_SHAPES = {
-    "linear": "{}",
-    "jump": "sign({})",
-    "absolute": "abs({})",
-    "square": "{}**2",
-    "cube": "{}**3",
-}
 _TERMS = 3  # suspected terms that are proposed
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
 _WIDER = 2  # times the neurons
@@ -107,9 +100,8 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
     if test is None or result.residuals is None or result.residuals.verdict != "unmodelled":
         return
     for term in test.terms[:_TERMS]:
-        text = "1" if term.variable is None else _SHAPES[term.shape].format(term.variable)
         words = "a constant" if term.variable is None else ""
-        yield from _term(job, text, term.equation, term.coefficient, words)
+        yield from _term(job, term.term, term.equation, term.coefficient, words)
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
