@@ -1,7 +1,7 @@
 """How often is a term said to be missing from a motion where none is, and is the right one named where one is?
 
 A mass on a spring and a damper under steps of force, 400 rows of 50 ms: the equations are right (white and coloured
-noise; with a learner that is not needed), or lack Coulomb friction or a cubic spring.
+noise; with a learner that is not needed), or lack Coulomb friction, a cubic spring, or that the force saturates.
 Run: python benchmarks/missing_terms.py [draws, default 100]
 """
 
@@ -31,6 +31,8 @@ class Case(NamedTuple):
     name: str
     friction: float = 0.0
     cube: float = 0.0
+    limit: float = np.inf
+    """Force at which the actuator saturates [N]."""
     colour: float = 0.0
     """Of the noise, as the coefficient of an autoregression of first order."""
     learner: bool = False
@@ -48,6 +50,7 @@ CASES = (
     Case("friction, coloured noise", friction=0.6, colour=0.9, truth=("v", "v", "jump")),
     Case("cubic spring", cube=40.0, truth=("v", "x", "cube")),
     Case("cubic spring, learner of v", cube=40.0, learner=True, truth=("v", "x", "cube")),
+    Case("saturating actuator", limit=5.0, truth=("v", "u", "beyond")),
 )
 
 
@@ -58,7 +61,13 @@ def record(case: Case, draw: int) -> oa.Record:
     x, found, h = np.zeros(2), [], TS / FINE
 
     def rate(x: np.ndarray, u: float) -> np.ndarray:
-        own = u - C * x[1] - K * x[0] - case.friction * np.tanh(x[1] / 0.05) - case.cube * x[0] ** 3
+        own = (
+            np.clip(u, -case.limit, case.limit)
+            - C * x[1]
+            - K * x[0]
+            - case.friction * np.tanh(x[1] / 0.05)
+            - case.cube * x[0] ** 3
+        )
         return np.array([x[1], own / M])
 
     for u in force:

@@ -67,6 +67,9 @@ class Learner(Protocol):
         ...
 
 
+_SMALL_PRODUCT = 128  # weights of a layer whose product is summed in the step of a run
+
+
 @dataclass(frozen=True)
 class MLP:
     """Fully connected feedforward network with a linear output layer.
@@ -189,11 +192,14 @@ class MLP:
 
 
 def _few_rows_product(weight: Any, z: Any) -> Any:
-    """Return `weight @ z` as sums of products, which become part of the step that needs them.
+    """Return `weight @ z` as sums of products where it is small.
 
-    A matrix product is a call of its own, and takes ten times as long as the few numbers of runs
-    side by side (benchmarks/small_products.py).
+    They become part of the step of a run that needs them. A matrix product is a call of its own,
+    which takes several times as long as the few numbers of runs side by side
+    (benchmarks/small_products.py).
     """
+    if weight.size > _SMALL_PRODUCT:
+        return weight @ z
     return jnp.sum(weight * z, axis=1)
 
 
