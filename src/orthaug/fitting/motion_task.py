@@ -155,7 +155,8 @@ def descend_by_lengths(
     ends: list[FreeRunFit] = []
     iterations, seconds = 0, 0.0
     q, rows = initial, None
-    for length in _lengths(own, initial):
+    begun = own.settle(initial, iterations=_SETTLING)
+    for length in _lengths(own, initial, begun):
         short = own.over(length)
         end = descend_from(short, solver.at_most(_SHORT_ITERATIONS), [q, initial], rows)
         if end is None:
@@ -167,7 +168,8 @@ def descend_by_lengths(
     for start, known in ((q, rows), (initial, None)):
         if start is initial and ends and (q is initial or _follows(own, ends[0])):
             continue
-        end = descend_from(own, solver, [start], known, progress)
+        states = begun if start is initial and known is None else None
+        end = descend_from(own, solver, [start], known, progress, states)
         if end is not None:
             ends.append(end)
             iterations, seconds = iterations + end.iterations, seconds + end.seconds
@@ -177,16 +179,17 @@ def descend_by_lengths(
     return best._replace(iterations=iterations, seconds=seconds)
 
 
-def _lengths(own: SegmentedMotion, initial: Vector) -> list[int]:
+def _lengths(own: SegmentedMotion, initial: Vector, states: np.ndarray) -> list[int]:
     """Return the lengths of segments before whole ones.
 
-    None where those follow the outputs from `initial`: each length compiles its own programs.
+    None where those follow the outputs from `initial` and these starts: each length compiles its
+    own programs.
     """
     steps = own.segments.steps
     lengths = [steps // _LONGER**i for i in range(20, 0, -1) if steps // _LONGER**i >= _SHORTEST]
     if not lengths:
         return []
-    objective, states = own.objective(), own.settle(initial, iterations=_SETTLING)
+    objective = own.objective()
     whole = objective.evaluate(initial, Start(states))
     return [] if _follows_most(own, _squared_errors(own, objective, whole)) else lengths
 
@@ -197,10 +200,11 @@ def descend_from(
     starts: list[Vector],
     rows: list[np.ndarray] | None,
     progress: RunProgress = quiet,
+    settled: np.ndarray | None = None,
 ) -> FreeRunFit | None:
     """Return the end of a descent from the best of the starts.
 
-    Its segments begin at states that follow the outputs.
+    Its segments begin at states that follow the outputs: `settled` where they are known.
 
     None where no run is finite.
     """
@@ -209,7 +213,7 @@ def descend_from(
     objective = segmented.objective()
     places = []
     for q in starts:
-        states = segmented.settle(q, iterations=_SETTLING)
+        states = segmented.settle(q, iterations=_SETTLING) if settled is None else settled
         places.append((objective.evaluate(q, Start(states)).loss, q, states))
     loss, q, states = min(places, key=lambda place: place[0])
     if not np.isfinite(loss):

@@ -180,8 +180,16 @@ def sensitivity(
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
 
 
-# For one call: compiled in a quarter of the time
-sensitivity_once = quick_jit(sensitivity.__wrapped__, static_argnames="dynamics")
+@partial(quick_jit, static_argnames="dynamics")
+def sensitivity_once(
+    dynamics: Dynamics,
+    numbers: Numbers,
+    segments: Segments,
+    states: Float[Array, "k n0 m"],
+    weight: Float[Array, "ny ny"],
+) -> Sensitivity:
+    """Return `sensitivity` of dynamics for which it is called once: its compilation counts."""
+    return sensitivity(dynamics, numbers, segments, states, weight)
 
 
 def chunk_sensitivity(
