@@ -697,10 +697,10 @@ def test_a_motion_that_would_take_too_much_is_refused_from_python() -> None:
 
 
 def test_a_model_of_segments_that_were_not_padded_is_split_as_ever() -> None:
-    """Earlier versions kept a single segment alone; it stands beside an empty one now."""
+    """Earlier versions kept a single segment alone; it is beside empty ones now."""
     fit = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
     kept = fit.model.trained
-    assert kept is not None and np.shape(kept.states)[-1] == 2
+    assert kept is not None and np.shape(kept.states)[-1] == 4
     slope = None if kept.slope is None else np.asarray(kept.slope)[..., :1]
     alone = kept._replace(states=np.asarray(kept.states)[..., :1], slope=slope)
     again = reopen_estimate(replace(fit.model, trained=alone), data()).split(oa.Training())

@@ -81,7 +81,9 @@ def training_bar(
     Args:
         rows: of the training data. Where there are many, the rate in rows/s is shown.
     """
+    line = _Lines(runs, iterations)
     if not wanted:
+        line.follow()
         yield SILENT
         return
     from rich.progress import TimeElapsedColumn, TimeRemainingColumn
@@ -94,7 +96,6 @@ def training_bar(
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
-        line = _Lines(runs, iterations)
         stage: Stage | None = None
 
         def show(run: int, iteration: int, loss: float) -> None:
@@ -127,10 +128,7 @@ def training_bar(
         except KeyboardInterrupt:
             raise KeyboardInterrupt(reached) from None
         finally:
-            if line.wanted:  # the result is written after the bar has ended
-                follow_training(line.enter, _tell_model)
-            else:
-                stop_following()
+            line.follow()  # the result is written after the bar has ended
         if interrupted.is_set():
             raise KeyboardInterrupt(reached)
 
@@ -145,6 +143,13 @@ class _Lines:
         self.runs, self.iterations = runs, iterations
         self.wanted, self._last = os.environ.get(PROGRESS_VARIABLE) == "json", -_OFTEN
         self._first, self._plan = 0, ()
+
+    def follow(self) -> None:
+        """Write the stages and models that follow, where lines are wanted."""
+        if self.wanted:
+            follow_training(self.enter, _tell_model)
+        else:  # an earlier command of this process may have been followed
+            stop_following()
 
     def enter(self, stage: str) -> None:
         """Write that the fit has come to a stage."""
