@@ -1,7 +1,7 @@
 """What the products `W z` of a learner cost in the runs of a motion: as sums, and as matrix products.
 
 A pendulum with a learner of one or two hidden layers, runs of 600 steps side by side: the run alone, and with its
-sensitivities. A ratio is the time with `MLP.apply` as it is over that with matrix products only, medians of 30 in turn.
+sensitivities. A ratio is the time with `MLP.apply` as it is over that with matrix products only, medians of 15 in turn.
 Run: python benchmarks/small_products.py
 """
 
@@ -20,7 +20,7 @@ from orthaug._base.jax import jax
 from orthaug.fitting.segments import Segments, respond, sensitivity
 from orthaug.models.learners import MLP
 
-STEPS, RUNS = 600, 30
+STEPS, RUNS = 600, 15
 LANES, HIDDEN = (1, 4, 16), ((8,), (32,), (16, 16))
 
 

@@ -121,6 +121,24 @@ def test_advice_that_is_followed_does_what_it_says(tmp_path):
     assert not any("sign(v[k-1])" in a.text for a in followed.result.advice)
 
 
+def test_a_dead_time_is_advised_as_one_with_all_lags_of_the_input(tmp_path):
+    """A declared nk of 1 where 5 is true was advised as one further lag of the input."""
+    data = driven(lambda k, v, u: 0.9 * v + 0.1 * u)
+    data = np.column_stack([data[4:, 0], data[:-4, 1]])  # the output comes 4 samples later
+    learner = 'kind = "mlp"\nhidden = [2]\ninputs = ["u[k-1]"]\n[lags]\nna = 1\nnb = 1\n'
+    for end in ('kind = "none"', learner):
+        spec = put(tmp_path, LAGGED.replace('kind = "none"', end), data)
+        fitted = oa.fit_spec(str(spec))
+        first = fitted.result.advice[0]
+        assert first.text.startswith("With u 4 samples later, from u[k-5] on, the free run")
+        assert [term["regressor"] for term in first.change["baseline.terms"]] == [
+            "v[k-1]",
+            "u[k-5]",
+        ]
+        assert first.after < 0.2 * first.before
+    assert first.change["learner.inputs"] == ["u[k-5]"] and first.change["lags.nk"] == [5]
+
+
 def test_a_term_that_looks_best_but_hurts_where_nothing_was_fitted_is_not_advised(tmp_path):
     """Over the record u² explains most of the residual, but it turns its sign where the rows are held out."""
 

@@ -88,7 +88,6 @@ CONCEPTS = {
     "reports.page_learned": "a section of the page",
     "selection.candidates": "which terms can be chosen",
     "selection.explaining": "the regression behind `explain`",
-    "selection.first_orders": "orders for a first spec",
     "selection.roles": "inputs and outputs by what predicts what",
     "selection.rivals": "candidates that a chosen term may replace",
     "selection.selecting": "the verb `select`",

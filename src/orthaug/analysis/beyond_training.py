@@ -25,6 +25,8 @@ _FAR = (1e4, 1e7)  # times the states of the run
 _DIRECTIONS = 8
 _SAME = 1e-9  # of the largest entry: more is another matrix
 _LONGEST_STATE = 200
+# From 1: a spectral radius that close belongs to an integrator, in a million samples at least
+_INTEGRATES = 1e-6
 
 
 def radius_beyond(model: Model, states: Matrix, inputs: Matrix) -> float | None:
@@ -68,10 +70,13 @@ def describe_beyond(model: Model, radius: float | None) -> str:
     if radius is None:
         return ""
     does = "fades" if model.form.beyond == "fade" else "stays constant"
-    text = (
-        f"Beyond the training data the learned correction {does}, so it is bounded. The physics "
-        f"alone has a spectral radius of {radius:.4g} there"
-    )
+    opening = f"Beyond the training data the learned correction {does}, so it is bounded. "
+    if abs(radius - 1) < _INTEGRATES:
+        return (
+            f"{opening}The physics alone integrates there: under an input that does not average to "
+            "zero the free run grows without bound."
+        )
+    text = f"{opening}The physics alone has a spectral radius of {radius:.4g} there"
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
     return f"{text}, so that proves no bound of the free run there."

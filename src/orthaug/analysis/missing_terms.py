@@ -370,8 +370,9 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     equations = doubted_equations(fit)
     rows = fit.segmented.segments.count * len(motion.outputs)
     tried = _Tried(*_variables(motion), _products(motion.visible), _WIDTHS)
-    if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
-        tried = tried._replace(products=[], beyond=())
+    for fewer in ({"products": []}, {"beyond": ()}):
+        if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
+            tried = tried._replace(**fewer)
     sizes: list[_Sizes] = []
 
     def terms(points: Matrix) -> Terms:
@@ -401,7 +402,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         made = (equation, number, float(coefficients[j]), float(shares[j]))
         listed.append(_term(tried, sizes[0], *made))
     for j, term in zip(order, listed, strict=True):
-        if term.width is not None:
+        if term.shape in (BEYOND, "cube"):
             best = _finer(fit, tried, equations[j // tried.count], term)
             listed = _with_finer(listed, best)
             break
@@ -417,7 +418,7 @@ def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTer
     others = [one for one in listed if (one.equation, one.variable, one.shape) != same]
     if not others or 1 - best.share < _RIVAL * (1 - others[0].share):
         return [best, *(one for one in others if one.share > _RIVAL * best.share)]
-    return [others[0], best, *others[1:]]
+    return [others[0], *([best] if best.share > others[0].share else []), *others[1:]]
 
 
 def _finer(fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm) -> MissingTerm:

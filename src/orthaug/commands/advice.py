@@ -64,6 +64,7 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
         )
     found = [
         *_lags(job, result),
+        *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),

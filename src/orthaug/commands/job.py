@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
@@ -218,6 +218,10 @@ class JobPhysics(ABC, Generic[P, F]):
     def settled(self, fit: F) -> dict[str, Any]:
         """Return the values of a spec that a fit has chosen, as a change of the spec."""
         return {}
+
+    def with_delays(self, job: Job) -> Iterator[tuple[dict[str, Any], str]]:
+        """Yield changes of a spec by which an input acts later, with words."""
+        yield from ()
 
     def explained_residual(self, fit: F) -> Callable[[SuspectResult], tuple[float, float]] | None:
         """Return a function that gives the share of the residual that a suspect explains.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, Warning
+from orthaug._base.lines import plural
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.physics_findings import bias_before, imitable_before
 from orthaug.analysis.suspects import Suspect
@@ -115,6 +117,24 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
             change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
             change[f"physics.theta.{name}"] = name
         return change, f"in the physics{f' of {place}' if several else ''}"
+
+    def with_delays(self, job: Job) -> Iterator[tuple[dict[str, Any], str]]:
+        """Yield changes of a spec by which an input acts from its first significant lag on.
+
+        With words. Where the spec has it act earlier.
+        """
+        from orthaug.selection.first_orders import first_significant_lag
+
+        record = job.train.record
+        for number, name in enumerate(job.spec.data.inputs):
+            declared = [lag.lag for lag in job.problem.layout if lag.channel == name]
+            found = first_significant_lag(record, number) if declared else None
+            if found is not None and found > min(declared):
+                late = found - min(declared)
+                yield (
+                    _delayed(job, name, late),
+                    (f"{name} {plural(late, 'sample')} later, from {name}[k-{found}] on,"),
+                )
 
     def explained_residual(
         self, fit: LaggedEstimate
@@ -304,3 +324,27 @@ def _train(problem: Problem, **options: Any) -> LaggedEstimate:
     from orthaug.fitting.estimation import fit
 
     return fit(problem, **options)
+
+
+def _delayed(job: Job, name: str, late: int) -> dict[str, Any]:
+    """Return the change of a spec in which all lags of an input are larger by `late`."""
+    declaration = job.declaration
+    read = re.compile(rf"(?<![\w.]){re.escape(name)}\[k(?:-(\d+))?\]")
+
+    def later(text: Any) -> Any:
+        if not isinstance(text, str):
+            return text
+        return read.sub(lambda found: f"{name}[k-{int(found[1] or 0) + late}]", text)
+
+    terms = [
+        {**term, "regressor": later(term["regressor"])} for term in declaration["baseline"]["terms"]
+    ]
+    change: dict[str, Any] = {"baseline.terms": terms}
+    if "inputs" in declaration.get("learner", {}):
+        change["learner.inputs"] = [later(text) for text in declaration["learner"]["inputs"]]
+    if "lags" in declaration:
+        nk = declaration["lags"].get("nk", 1)
+        each = nk if isinstance(nk, list) else [nk] * len(job.spec.data.inputs)
+        pairs = zip(job.spec.data.inputs, each, strict=True)
+        change["lags.nk"] = [first + late * (own == name) for own, first in pairs]
+    return change

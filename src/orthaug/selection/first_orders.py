@@ -74,7 +74,7 @@ def first_model(record: Record) -> FirstModel | None:
     record = _spread_windows(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
     offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
-    delays = tuple(_delay(record, i) for i in range(len(record.inputs)))
+    delays = tuple(first_significant_lag(record, i) for i in range(len(record.inputs)))
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     first_lags = [*dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))])]
@@ -151,7 +151,7 @@ def _spread_windows(record: Record) -> Record:
     return witness(RecordSource(record, 0), LOOKED_AT)
 
 
-def _delay(record: Record, number: int) -> int | None:
+def first_significant_lag(record: Record, number: int) -> int | None:
     """Return the first lag of an input with an effect beside past outputs and all other lags.
 
     Where rows or excitation do not allow that, by the cross-correlation with the input made white;
