@@ -420,8 +420,8 @@ def free_run_words(
         remedy = "" if modelled or fit.problem.motion.held else _BY_INNOVATIONS
         fed = "sensor noise that the controller feeds back, " if fit.problem.motion.held else ""
         return (
-            f"{subject} ({sizes}) is coloured ({colour}). It follows {no_input}no state "
-            f"at the same instant, and no simple missing term. Its cause is {fed}"
+            f"{subject} ({sizes}) is coloured ({colour}). The tests of the residual find {no_input}"
+            f"no state at the same instant and no simple missing term behind it. Its cause is {fed}"
             f"disturbances, or physics missing in an equation {learner}.{remedy}"
         )
     if late:
