@@ -2,6 +2,8 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from test_cli import run
 
 import orthaug as oa
 from orthaug import stability
+from orthaug.analysis.beyond_training import describe_beyond
 
 
 def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
@@ -249,3 +252,13 @@ def test_nonlinear_physics_proves_nothing():
     terms = [oa.Term("a", "y[k-1]"), oa.Term("c", "y[k-1]**2"), oa.Term("b", "u[k-1]")]
     fit = oa.estimate(record, oa.Baseline.from_terms(terms), learner=oa.MLP((4,)), fallback=False)
     assert stability(fit.model, record).radius_beyond is None
+
+
+@pytest.mark.parametrize("radius", [1 - 1e-15, 1.0, 1 + 1e-9])
+def test_an_integrator_is_no_proof_of_a_bounded_run(radius: float) -> None:
+    """0.9999999999999999 is below 1, and was called a proof beside "has an integrator"."""
+    model = cast(Any, SimpleNamespace(form=SimpleNamespace(beyond="fade")))
+    text = describe_beyond(model, radius)
+    assert "integrates there" in text and "proof" not in text
+    assert "This is a proof" in describe_beyond(model, 0.99)
+    assert "proves no bound" in describe_beyond(model, 1.01)
