@@ -407,7 +407,7 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     for j, term in zip(order, listed, strict=True):
         if term.shape in (BEYOND, "cube"):
             best = _finer(fit, tried, equations[j // tried.count], term)
-            listed = _with_finer(listed, best)
+            listed = listed if best is None else _with_finer(listed, best)
             break
     return MissingTest(p, freedom, share, tuple(listed))
 
@@ -424,8 +424,13 @@ def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTer
     return [others[0], *([best] if best.share > others[0].share else []), *others[1:]]
 
 
-def _finer(fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm) -> MissingTerm:
-    """Return a term that begins beyond a size, with the best of many sizes."""
+def _finer(
+    fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm
+) -> MissingTerm | None:
+    """Return a term of the same variable that begins beyond a size, the best of many sizes.
+
+    None where it explains no more than the given one.
+    """
     i = tried.names.index(str(term.variable))
     one = _Tried((tried.names[i],), tried.choice[i : i + 1], [], _FINER)
     sizes: list[_Sizes] = []
@@ -437,12 +442,12 @@ def _finer(fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm)
     found = sensitivities(fit, [equation], terms, len(_FINER))
     tested = None if found is None else _joint_test(found)
     if tested is None:
-        return term
+        return None
     *_, gains, shares, coefficients = tested
     j = int(np.argmax(gains))
     made = (term.equation, one.simple + j, float(coefficients[j]), float(shares[j]))
     best = _term(one, sizes[0], *made)
-    return best if best.share > term.share else term
+    return best if best.share > term.share else None
 
 
 def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:

@@ -380,8 +380,10 @@ def advise(
 
     None where nothing is proposed, or nothing can be tried.
     """
+    if job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
+        return None
     found = proposals(job, result, fit)
-    if not found or job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
+    if not found:
         return None
     try:
         rows = ValidationRows.of(job)

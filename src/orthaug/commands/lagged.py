@@ -342,6 +342,11 @@ def _delayed(job: Job, name: str, late: int) -> dict[str, Any]:
     change: dict[str, Any] = {"baseline.terms": terms}
     if "inputs" in declaration.get("learner", {}):
         change["learner.inputs"] = [later(text) for text in declaration["learner"]["inputs"]]
+    if "suspects" in declaration:
+        change["suspects"] = [
+            {key: later(value) for key, value in suspect.items()}
+            for suspect in declaration["suspects"]
+        ]
     if "lags" in declaration:
         nk = declaration["lags"].get("nk", 1)
         each = nk if isinstance(nk, list) else [nk] * len(job.spec.data.inputs)

@@ -130,9 +130,8 @@ class SegmentedMotion(SegmentedProblem):
         0 for whole experiments.
         """
         shape = None if self.like is None else self.like.over(segment).segments
-        lanes = few_lanes(segment) if segment else 1
         made = (self.record, self.dynamics, segment, 0, shape, self.shares)
-        segments = build_segments(*made, lanes=lanes)
+        segments = build_segments(*made, lanes=few_lanes(segment))
         return replace(
             self, segments=segments, free_run=replace(self.free_run, segment=segment, washout=0)
         )

@@ -98,8 +98,11 @@ def build_segments(
 
 
 def few_lanes(steps: int) -> int:
-    """Return how many short segments always run side by side: records share their programs."""
-    return max(_LANES, 1 << max(SHORT // steps, 1).bit_length() - 1)
+    """Return how many segments of so many steps always run side by side; 0 for whole experiments.
+
+    Records share the programs of short segments then.
+    """
+    return _LANES if not steps else max(_LANES, 1 << max(SHORT // steps, 1).bit_length() - 1)
 
 
 def begins_of(rows: int, steps: int, washout: int) -> list[int]:
@@ -181,15 +184,9 @@ def sensitivity(
 
 
 @partial(quick_jit, static_argnames="dynamics")
-def sensitivity_once(
-    dynamics: Dynamics,
-    numbers: Numbers,
-    segments: Segments,
-    states: Float[Array, "k n0 m"],
-    weight: Float[Array, "ny ny"],
-) -> Sensitivity:
+def sensitivity_once(dynamics: Dynamics, *given: Any) -> Sensitivity:
     """Return `sensitivity` of dynamics for which it is called once: its compilation counts."""
-    return sensitivity(dynamics, numbers, segments, states, weight)
+    return sensitivity(dynamics, *given)
 
 
 def chunk_sensitivity(

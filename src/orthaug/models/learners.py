@@ -503,8 +503,10 @@ class Bound:
 
     def one_of_many(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """Return `from_leaves` where thousands of rows are mapped side by side."""
-        apply = getattr(self.learner, "apply_to_many", self.learner.apply)
-        return apply(self.tree(leaves), z)
+        learner = self.learner
+        if isinstance(learner, MLP) and type(learner).apply is MLP.apply:  # no subclass's own
+            return learner.apply_to_many(self.tree(leaves), z)
+        return self.from_leaves(leaves, z)
 
     def tree(self, leaves: list[Any]) -> Tree:
         """Return the learner's own weights, of the weight arrays."""

@@ -133,7 +133,8 @@ class Motion(NotebookView):
     definitions: tuple[tuple[str, Expression], ...] = ()
     """Names for longer expressions, each after those that it uses."""
     integrator: str = "rk4"
-    substeps: int | None = field(default=None, compare=False)  # compiled programs have the chosen
+    # Not compared: a compiled program has the number that was chosen, declared or not
+    substeps: int | None = field(default=None, compare=False)
     """Steps of the integrator in a sample; None to choose them by the data."""
     hold: str = "zero-order"
     functions: tuple[Callable[..., Any], Callable[..., Any]] | None = None

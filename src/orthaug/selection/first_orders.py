@@ -157,6 +157,7 @@ def first_significant_lag(record: Record, number: int) -> int | None:
     Where rows or excitation do not allow that, by the cross-correlation with the input made white;
     where none is significant, by that of the input's square.
     """
+    record = _spread_windows(record)
     longest = max(map(len, record.experiments))
     found, most = [], max(_MOST, min(_DELAY, longest // _PER_DELAY))
     long = tuple(e for e in record.experiments if len(e) > 2 * most)
