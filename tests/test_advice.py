@@ -127,7 +127,8 @@ def test_a_dead_time_is_advised_as_one_with_all_lags_of_the_input(tmp_path):
     data = np.column_stack([data[4:, 0], data[:-4, 1]])  # the output comes 4 samples later
     learner = 'kind = "mlp"\nhidden = [2]\ninputs = ["u[k-1]"]\n[lags]\nna = 1\nnb = 1\n'
     for end in ('kind = "none"', learner):
-        spec = put(tmp_path, LAGGED.replace('kind = "none"', end), data)
+        text = LAGGED.replace('kind = "none"', end) + suspect("cubic", "u[k-1]")
+        spec = put(tmp_path, text, data)
         fitted = oa.fit_spec(str(spec))
         first = fitted.result.advice[0]
         assert first.text.startswith("With u 4 samples later, from u[k-5] on, the free run")
@@ -135,6 +136,7 @@ def test_a_dead_time_is_advised_as_one_with_all_lags_of_the_input(tmp_path):
             "v[k-1]",
             "u[k-5]",
         ]
+        assert "u[k-5]" in str(first.change["suspects"]) and "u[k-1]" not in str(first.change)
         assert first.after < 0.2 * first.before
     assert first.change["learner.inputs"] == ["u[k-5]"] and first.change["lags.nk"] == [5]
 

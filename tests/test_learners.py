@@ -289,3 +289,19 @@ def test_groups_are_neurons(learner, nz, ny, expected):
 def _in_order(labels):
     names = {}
     return [names.setdefault(label, len(names)) for label in labels]
+
+
+@pytest.mark.parametrize("hidden", [(3,), (16, 16)])
+def test_rows_of_many_have_the_values_of_one(hidden: tuple[int, ...]) -> None:
+    """Small products are sums in the step of a run, and matrix products over thousands of rows."""
+
+    class Doubled(MLP):
+        def apply(self, tree, z):
+            return 2 * super().apply(tree, z)
+
+    for learner in (MLP(hidden), Doubled(hidden)):
+        bound = Bound(learner, 2, 1)
+        w, z = bound.init(jax.random.key(1)), np.array([0.3, -0.7])
+        np.testing.assert_allclose(
+            bound.one_of_many(bound.leaves(w), z), bound.values(w, z), rtol=1e-12
+        )
