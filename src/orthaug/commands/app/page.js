@@ -107,7 +107,7 @@ function shown(part, first) {
 }
 function arrive() {
   const place = +sessionStorage.getItem(memory("scroll"));
-  arriving = Date.now() + 3000;
+  arriving = Date.now() + 30_000; // a slow machine draws a part many seconds late; a key or the mouse ends it
   let there = 0; // since when; what is drawn late may still move it for a moment
   const seek = () => {
     scrollTo(0, place);
