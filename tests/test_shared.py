@@ -415,6 +415,10 @@ COMPUTED = {  # from what the learner sees, and what the rows must say of it
         lambda v, p, rng: np.sign(v + 0.1 * v.std() * rng.normal(size=len(v))),
         "nearly_shared",
     ),
+    "moved a little": (  # all but little is linear in what the learner sees
+        lambda v, p, rng: v + 0.05 * v.std() * rng.normal(size=len(v)),
+        "little_left",
+    ),
     "lagged": (lambda v, p, rng: np.roll(v, 20), None),
     "filtered": (lambda v, p, rng: scipy.signal.lfilter([0.05], [1, -0.95], v), None),
     "independent": (lambda v, p, rng: rng.normal(size=len(v)), None),
@@ -452,7 +456,7 @@ def test_check_asks_the_rows_what_the_learner_could_imitate(tmp_path, column, co
     done = run("check", tmp_path / "stage.toml", "--json")
     assert done.code == 0, done.err
     result = json.loads(done.out)
-    codes = ("shared_on_data", "nearly_shared")
+    codes = ("shared_on_data", "nearly_shared", "little_left")
     told = {one["code"]: one["text"] for one in result["warnings"] if one["code"] in codes}
     assert list(told) == ([code] if code else [])
     assert ("e" in result["shared"]["determined"]) == (code != "shared_on_data")

@@ -28,6 +28,7 @@ from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
+from orthaug.analysis.quantised_output import quantised_output
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import (
     SHARE,
@@ -147,7 +148,8 @@ def _of_motion(
         return None
     if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
         return None
-    errors = errors_of(free_run)
+    coarse = quantised_output(fit, free_run)
+    errors = errors_of(free_run) if coarse is None else coarse.left
     firsts = [run.start for run in free_run.trajectories]
     inputs = [e.inputs[first:] for e, first in zip(record.experiments, firsts, strict=True)]
     states = [own[first:] for own, first in zip(_states(fit), firsts, strict=True)]
@@ -157,7 +159,10 @@ def _of_motion(
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
         shares = tuple(_predictable(i, test, errors, inputs) for i, test in enumerate(tests))
-        missing = missing_terms(fit)
+        missing = missing_terms(fit) if coarse is None else None
+        if coarse is not None and any(test.white is None for test in tests):
+            coarse = replace(coarse, whole=True)  # no more than a row here and there is left
+            tests = analyse(errors_of(free_run), inputs, states, *names, lags=LAGS)
     if any(test.white is None for test in tests):
         return None
     followed = {test.name: test.follows() for test in tests if test.follows()}
@@ -167,6 +172,8 @@ def _of_motion(
     explained = any(share.inputs > _SMALL for share in shares) or bool(curved)
     explained = explained or lacks is not None or several is not None
     white = all(test.practically_white() for test in tests)
+    if coarse is not None and coarse.whole:
+        white, explained = True, False
     size = rms_errors(free_run) / fit.problem.deviation
     late = (
         _late_inputs(fit)
@@ -174,8 +181,10 @@ def _of_motion(
         else ()
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
-    text = free_run_words(verdict, fit, tests, shares, followed, curved, lacks or several, late)
-    warnings = [one.warning for one in late]
+    text = free_run_words(
+        verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse
+    )
+    warnings = [one.warning for one in late] + ([coarse.warning] if coarse else [])
     warnings += [] if white or fit.model.coloured else find_drift(free_run, "innovations")
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
     warnings += (
@@ -186,7 +195,7 @@ def _of_motion(
         ]
     )
     found = (verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
-    return Diagnosis(*found, late=late)
+    return Diagnosis(*found, late=late, steps=coarse.steps if coarse else None)
 
 
 def _late_inputs(fit: MotionEstimate) -> tuple[LateInput, ...]:

@@ -275,18 +275,40 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         in standard errors.
     """
     motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
-    slope, substeps = fit.split_by.slope, segmented.dynamics.substeps
+    substeps = segmented.dynamics.substeps
     if (
         motion.scheme.discrete
         or fit.scores is None
-        or slope is None
+        or fit.split_by.slope is None
         or 2 * substeps > MOST_SUBSTEPS
     ):
         return None
     c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
     finer = segmented.with_substeps(2 * substeps)
     outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
-    moved = segmented.segments._replace(target=outputs)  # whose errors are what the finer steps add
+    step = coordinates_moved(fit, outputs)
+    if step is None:
+        return None
+    value = parameters_moved(fit, step)
+    errors = np.abs(value) / np.where(fit.known_std > 0, fit.known_std, np.nan)
+    found = SubstepBias(motion.names, substeps, value, errors)
+    return replace(found, warnings=_warnings(found, fit))
+
+
+def coordinates_moved(fit: MotionEstimate, outputs: Float[np.ndarray, "k T ny m"]) -> Vector | None:
+    """Return by how much a fit's (c, w) move with what `outputs` differ from its free run.
+
+    That is `(SᵀS + ridge)⁻¹SᵀΔy`, to first order; a coordinate at its bound does not move. None
+    where the information is not finite, or the fit has no normal equations.
+
+    Args:
+        outputs: those of the free run over the segments, with an effect on them.
+    """
+    motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
+    if fit.scores is None:
+        return None
+    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
+    moved = segmented.segments._replace(target=outputs)
     slopes = sensitivity(
         segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight
     )
@@ -302,10 +324,12 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
     )
     step = np.zeros(len(free))
     step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
-    value = motion.coordinates.slopes(fit.theta) * (slope @ step)
-    errors = np.abs(value) / np.where(fit.known_std > 0, fit.known_std, np.nan)
-    found = SubstepBias(motion.names, substeps, value, errors)
-    return replace(found, warnings=_warnings(found, fit))
+    return step
+
+
+def parameters_moved(fit: MotionEstimate, step: Vector) -> Vector:
+    """Return by how much p̂ (np,) moves with a step of (c, w): the learner's split counts."""
+    return fit.problem.motion.coordinates.slopes(fit.theta) * (fit.split_by.slope @ step)
 
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:

@@ -13,6 +13,7 @@ from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.input_timing import LateInput
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
+from orthaug.analysis.quantised_output import QuantisedOutput
 from orthaug.analysis.residuals import ResidualTest
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
@@ -401,12 +402,23 @@ def free_run_words(
     curved: dict,
     lacks: MissingTest | None,
     late: tuple[LateInput, ...],
+    coarse: QuantisedOutput | None = None,
 ) -> str:
-    """Return the verdict on a motion's free run in words, with its reason."""
+    """Return the verdict on a motion's free run in words, with its reason.
+
+    Args:
+        coarse: the steps of the outputs, where these are most of the error.
+    """
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
     modelled = fit.model.coloured
     subject = "The error one step ahead" if modelled else "The free run's error"
+    if coarse is not None:
+        steps = join_words([f"{name} in steps" for name in coarse.steps])
+        if coarse.whole:
+            return f"The free run's error is that of recording {steps}: hardly more is left."
+        share = percent(coarse.share)
+        subject = f"{share} of the free run's error is that of recording {steps}. The rest"
     if verdict == "white" and modelled:
         noise = "is white: the gain of the predictor accounts for process noise and sensor noise."
         return f"{subject} ({sizes}) {noise}{small_effects(tests, shares)}"

@@ -92,4 +92,18 @@ def shared_warnings(shared: SharedDirections | None, inputs: Sequence[str]) -> l
             f"{remedy}"
         )
         found.append(Warning("nearly_shared", text))
+    if shared.little:
+        names = " and ".join(
+            f"{percent(share, 2)} of the regressor of {name}"
+            for name, share in shared.little.items()
+        )
+        text = (
+            f"functions of the learner's inputs ({sees}) follow all but {names}: only this part "
+            "determines the parameter. An effect that the physics lacks and that depends on the "
+            "same signals as this part goes into the parameter in full, and its interval does "
+            "not count it. Compare the value with that of physics alone. "
+            "Where they differ, declare the effect in [[suspects]] or write it into the physics, "
+            "or give data in which these signals move more."
+        )
+        found.append(Warning("little_left", text))
     return found

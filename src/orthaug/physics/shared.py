@@ -36,6 +36,8 @@ _ROUNDING = 1e-12  # of the largest singular value of features of unit size
 _SEED = 20_240_808
 NEARLY = 0.5
 """Share of a regressor below which what the learner's features leave of it is reported."""
+LITTLE = 0.01
+"""Of all squares of a regressor: below it, what the learner does not see decides its value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,23 @@ class SharedDirections:
         shares = zip(self.names, self.basis, self.rest.share, strict=True)
         return {
             name: float(share) for name, row, share in shares if not row.any() and share < NEARLY
+        }
+
+    @property
+    def little(self) -> dict[str, float]:
+        """Parameters that rest on little of their regressors, with its share of the squares.
+
+        What is linear in the features counts as followed by the learner here: exact as that is,
+        the value then is the effect of the signals that only this remainder holds.
+        """
+        if self.rest is None:
+            return {}
+        left, whole = np.diag(self.rest.left), np.maximum(np.diag(self.rest.whole), 1e-300)
+        shares = zip(self.names, self.basis, left / whole, strict=True)
+        return {
+            name: float(share)
+            for name, row, share in shares
+            if not row.any() and share < LITTLE and name not in self.nearly
         }
 
     def beside(self, rest: UnexplainedPhysics | None) -> SharedDirections:

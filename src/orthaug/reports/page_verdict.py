@@ -284,8 +284,8 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
         coarse = list(result.residuals.steps or {})
         yield {
-            "unmodelled": "its one-step residual is no larger than the quantisation steps of "
-            f"{join_words(coarse)}"
+            "unmodelled": f"its error is no larger than the steps in which {join_words(coarse)} "
+            f"{'is' if len(coarse) == 1 else 'are'} recorded"
             if coarse
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
@@ -451,8 +451,8 @@ def _option(result: FitResult) -> str | None:
     if result.residuals is not None and result.residuals.steps:
         steps = join_words(list(result.residuals.steps))
         return (
-            f"fewer samples, or a finer measurement, because the quantisation steps of {steps} "
-            "are as large as the one-step residual"
+            f"fewer samples, or a finer measurement, because the steps of {steps} are as large as "
+            "the error"
         )
     if not _noise_alone(result):
         return (
