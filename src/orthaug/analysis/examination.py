@@ -18,6 +18,7 @@ from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores, parameter_rows
+from orthaug.analysis.informative_data import explains_nothing, few_frequencies
 from orthaug.analysis.physics_findings import analyse_physics, describe_physics, imitable
 from orthaug.analysis.robustness import robust_where_asked
 from orthaug.analysis.scoring import score_part
@@ -91,6 +92,9 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
         ran = {part.name: score_part(physics.model, part, []) for part in evidence.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
     one_step = isinstance(evidence.criterion, Prediction) or fit.model.coloured
+    if fit.status.ok and not one_step:
+        run, estimated = responses[evidence.train.name][1], len(fit.problem.names)
+        warnings += explains_nothing(run, evidence.train, estimated)
     if fit.status.ok and one_step and fit.learns:
         chosen_by = [p.name for p in evidence.parts if not p.name.startswith("tests.")]
         warnings += _one_step_only(scores, alone, chosen_by)
@@ -138,6 +142,7 @@ def _analyse(
         if fit.std is not None:  # the robust ones need no covariance of the weights
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
         warnings += closed_loop(evidence.train.record, evidence.method)
+        warnings += few_frequencies(evidence.train.record, len(fit.problem.names))
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")
     shared, of_shared = imitable(fit, evidence)
