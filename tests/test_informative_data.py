@@ -14,7 +14,8 @@ T = TS * np.arange(N)
 
 def multisine(lines: int) -> np.ndarray:
     phase = np.random.default_rng(0).uniform(0, 6.28, lines)
-    return sum(np.sin(2 * np.pi * 0.25 * (i + 1) * T + p) for i, p in enumerate(phase))
+    waves = [np.sin(2 * np.pi * 0.25 * (i + 1) * T + p) for i, p in enumerate(phase)]
+    return np.sum(waves, axis=0)
 
 
 NOISE = np.random.default_rng(1).normal(size=N)
