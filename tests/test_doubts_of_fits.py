@@ -372,6 +372,33 @@ def test_a_term_that_begins_beyond_a_size_is_named_with_that_size(
     assert best.coefficient < 0 and f"that begins at about |{variable}| = " in str(best)
 
 
+def test_a_loss_to_surroundings_counts_from_their_temperature():
+    """A term of an absolute temperature alone is mostly a constant: it was called a kink at its median."""
+    power, jacket = 3 + stepped(900, 5, held=15), 310 + 8 * stepped(900, 6, held=40)
+    at, out = 305.0, []
+    for p, j in zip(power, jacket, strict=True):
+        out.append(at)
+        for _ in range(20):
+            at += 5 / 20 * (0.05 * p + 0.012 * (j - at) - 0.02 * (at - 290))
+    y = np.array(out) + 0.05 * np.random.default_rng(7).normal(size=900)
+    inputs = ["power", "jacket"]
+    record = oa.Record.from_arrays(
+        np.column_stack([power, jacket]), y, sampling_time=5.0, inputs=inputs, outputs=["T"]
+    )
+    motion = oa.Motion.from_equations(
+        [oa.State("at", "b*power + g*exp(-0.001*jacket)*(jacket - at)", start="T")],
+        [oa.Output("T", "at")],
+        [oa.PhysicalParameter("b", 0.04), oa.PhysicalParameter("g", 0.02)],
+        inputs,
+        hold="zero-order",
+    )
+    found = missing_terms(oa.estimate(record, motion, learner=None))
+    best = found.terms[0]
+    assert best.shape == "linear" and best.variable in ("at", "jacket") and best.share > 0.8
+    assert best.reference == pytest.approx(290, abs=10)
+    assert best.term == f"({best.variable} - {best.reference:.4g})" and best.term in str(best)
+
+
 def test_a_mode_that_the_integrator_distorts_is_no_other_solution():
     """A fast mode far below a step is right under long steps alone: no warning names it."""
     u, x, wall, y = stepped(1200, 9, held=6), 0.0, 0.0, []

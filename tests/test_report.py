@@ -500,8 +500,8 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     }
     coarse = fit_verdict(motion.result.model_copy(update=changed))
     assert (
-        "its one-step residual is no larger than the quantisation steps of x" in coarse.trust
-        and "quantisation steps of x are as large" in coarse.then
+        "its error is no larger than the steps in which x is recorded" in coarse.trust
+        and "the steps of x are as large as the error" in coarse.then
     )
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
     far = test.simulation.model_copy(

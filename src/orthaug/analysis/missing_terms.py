@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
@@ -206,6 +206,7 @@ _ALONE = 0.05  # of the errors' variance: what a single term explains below it i
 _TOGETHER_LEVEL, _TOGETHER = 1e-6, 0.2  # of the joint test, and of the errors' variance
 _MOST_FACTORS = 5  # states and inputs, of which products are tried
 _ROWS_PER_PRODUCT = 10
+_CURVED = 0.95  # of its gain: a curved term that counts from a level is named before a straight one
 _RIVAL = 0.9  # of the best term's share, with which another one is named beside it
 # Of what the best simple term leaves: a term with the best of many widths is named first below it.
 # Saturations leave 0.2 to 0.6 of what a cube does, cubic springs 0.4 to 1 (missing_terms.py)
@@ -232,6 +233,10 @@ class MissingTerm:
     """Of a product, its variables; `variable` is then the product itself, linear in it the term."""
     width: float | None = None
     """Of a term that begins beyond a size of its variable, that size."""
+    reference: float | None = None
+    """Of a variable that keeps its sign, such as a temperature, what the term counts from: it is
+    the term's value there that is subtracted.
+    """
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -244,7 +249,10 @@ class MissingTerm:
         if self.variable is None:
             return "1"
         if self.width is None:
-            return _TERMS[SHAPES.index(self.shape)].format(self.variable)
+            term = _TERMS[SHAPES.index(self.shape)].format(self.variable)
+            if self.reference is None:
+                return term
+            return f"({term} {'-' if self.reference >= 0 else '+'} {abs(self.reference):.4g})"
         size = f"{self.width:.4g}"
         return f"(max({self.variable} - {size}, 0) + min({self.variable} + {size}, 0))"
 
@@ -262,6 +270,8 @@ class MissingTerm:
             place = f"about |{self.variable}| = {self.width:.3g}"
             return f"that begins at {place}, as a saturation, an end stop or a gap"
         words = _ONE_SIDED if self.one_sided else _MEANINGS
+        if self.reference is not None and self.shape == "linear":
+            return words[0].format(self.term)
         return (
             "constant"
             if self.variable is None
@@ -385,10 +395,11 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     found = sensitivities(fit, equations, terms, tried.count)
     if found is None:
         return None
-    tested = _joint_test(found)
+    constants = _constants(tried, sizes[0], len(equations))
+    tested = _joint_test(found, constants)
     if tested is None:
         return None
-    p, freedom, share, gains, shares, coefficients = tested
+    p, freedom, share, gains, shares, coefficients, references = tested
     if tried.count > tried.simple:
         # Simple terms are tested by themselves, too: the others would take power from them
         by_term = np.arange(len(gains)) % tried.count < tried.simple
@@ -397,13 +408,20 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
             p, freedom, share = alone[:3]
         p = min(2 * p, 1.0)
         gains = np.where(by_term, gains, _RIVAL * gains)
+    # Over a range that is small beside the level all shapes are nearly straight
+    straight = (np.arange(len(gains)) % tried.count - 1) % len(SHAPES) == SHAPES.index("linear")
+    gains = np.where(np.isfinite(references) & ~straight, _CURVED * gains, gains)
     order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
     listed = []
     for j in order:
         place, number = divmod(j, tried.count)
         equation = motion.names_of_states[equations[place]]
         made = (equation, number, float(coefficients[j]), float(shares[j]))
-        listed.append(_term(tried, sizes[0], *made))
+        term = _term(tried, sizes[0], *made)
+        if np.isfinite(references[j]):
+            unit = float(coefficients[j]) / term.coefficient
+            term = replace(term, reference=float(references[j]) * unit)
+        listed.append(term)
     for j, term in zip(order, listed, strict=True):
         if term.shape in (BEYOND, "cube"):
             best = _finer(fit, tried, equations[j // tried.count], term)
@@ -443,7 +461,7 @@ def _finer(
     tested = None if found is None else _joint_test(found)
     if tested is None:
         return None
-    *_, gains, shares, coefficients = tested
+    *_, gains, shares, coefficients, _ = tested
     j = int(np.argmax(gains))
     made = (term.equation, one.simple + j, float(coefficients[j]), float(shares[j]))
     best = _term(one, sizes[0], *made)
@@ -542,12 +560,30 @@ def _term(
     return MissingTerm(*made, sizes.one_sided[variable], width=width)
 
 
+def _constants(tried: _Tried, sizes: _Sizes, equations: int) -> Int[np.ndarray, "q"]:
+    """Return for each term the number of the constant beside which it is tried, -1 for none.
+
+    A linear term of an absolute temperature is mostly its mean: with a constant it counts from a
+    level that the rows determine.
+    """
+    own = np.full(tried.count, -1)
+    for variable, keeps in enumerate(sizes.one_sided):
+        if keeps:
+            first = 1 + len(SHAPES) * variable
+            own[first : first + len(SHAPES)] = 0
+    return np.concatenate([np.where(own == 0, i * tried.count, -1) for i in range(equations)])
+
+
 def _joint_test(
-    found: Sensitivities,
-) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector] | None:
+    found: Sensitivities, constants: Int[np.ndarray, "q"] | None = None
+) -> tuple[float, tuple[int, int], float, Vector, Vector, Vector, Vector] | None:
     """Return p, degrees of freedom and share of all terms.
 
-    Each term has its gain in filtered rows, its share and its coefficient.
+    Each term has its gain in filtered rows, its share, its coefficient, and the level from which it
+    counts where that leaves clearly less, NaN elsewhere.
+
+    Args:
+        constants: numbers of the constants beside which terms are tried, -1 for none.
     """
     plain = _regression(found, None)
     null = None if plain is None else _regression(found, _filters(found, plain.errors))
@@ -567,7 +603,38 @@ def _joint_test(
     size = np.einsum("rj,rj->j", rows.terms, rows.terms)
     size = np.where(size > 0, size, np.inf)
     along = rows.terms.T @ rows.errors
-    return p, (rank, freedom), _share(plain, basis), along**2 / size, _shares(plain), along / size
+    gains, shares, coefficients = along**2 / size, _shares(plain), along / size
+    references = np.full(len(gains), np.nan)
+    whole, unfiltered = float(rows.errors @ rows.errors), float(plain.errors @ plain.errors)
+    for j, constant in enumerate(() if constants is None else constants.tolist()):
+        pair = _beside_constant(rows, j, constant) if constant >= 0 else None
+        own = _beside_constant(plain, j, constant) if constant >= 0 else None
+        if pair is None or own is None:
+            continue
+        if whole - pair[0] < _LESS * (whole - max(gains[j], gains[constant])):
+            gains[j], coefficients[j], references[j] = pair
+            left = (1 - own[0] / unfiltered) * plain.left / max(plain.left - 2, 1)
+            shares[j] = max(1 - left, 0.0)
+    return p, (rank, freedom), _share(plain, basis), gains, shares, coefficients, references
+
+
+def _beside_constant(rows: _Regression, j: int, constant: int) -> tuple[float, float, float] | None:
+    """Return what a term and a constant explain, the term's coefficient, and where both are zero.
+
+    None where the term is nearly a constant, or either has no effect of its own.
+    """
+    one, term = rows.terms[:, constant], rows.terms[:, j]
+    square = float(one @ one)
+    if not square > 0:
+        return None
+    rest = term - one * (float(one @ term) / square)
+    size = float(rest @ rest)
+    if not size > _OWN**2 * float(term @ term):
+        return None
+    slope = float(rest @ rows.errors) / size
+    level = float(one @ rows.errors - slope * (one @ term)) / square
+    gain = float(one @ rows.errors) ** 2 / square + size * slope**2
+    return (gain, slope, -level / slope) if slope != 0 else None
 
 
 def _share(plain: _Regression, basis: Matrix) -> float:
