@@ -70,3 +70,31 @@ def test_noise_on_the_output_of_a_slow_system_takes_no_further_lags(seed):
     model = first_model(Record.from_arrays(u, y + 0.01 * y.std() * rng.normal(size=1500)))
     assert model is not None and model.orders.na == 2
     assert model.free_run[0] < 0.03
+
+
+def room(seed: int, coupling: float, rows: int = 1500) -> Record:
+    """Air and wall of a room, of which the wall is heated by the air alone."""
+    rng = np.random.default_rng(seed)
+    heat = np.repeat(rng.uniform(0, 3, rows // 30), 30)
+    air, wall, y = 15.0, 14.0, np.empty((rows, 2))
+    for k in range(rows):
+        y[k] = air, wall
+        air, wall = (
+            air + 0.08 * heat[k] + 0.02 * (5 - air) + coupling * (wall - air),
+            wall + 0.01 * (5 - wall) + 0.5 * coupling * (air - wall) + 0.01 * heat[k],
+        )
+    return Record.from_arrays(heat, y + 0.05 * rng.normal(size=y.shape))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_output_has_the_past_of_another_where_that_drives_it(seed):
+    """It had its own past only: a free run of the wall left half of its deviation."""
+    model = first_model(room(seed, 0.05))
+    assert model is not None and (1, 0) in model.across
+    assert max(model.free_run) < 0.15
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_that_do_not_act_on_each_other_have_no_past_of_the_other(seed):
+    model = first_model(room(seed, 0.0))
+    assert model is not None and not model.across

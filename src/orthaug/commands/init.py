@@ -14,7 +14,7 @@ import tomlkit
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
-from orthaug._base.lines import first_words, percent, plural
+from orthaug._base.lines import first_words, join_words, percent, plural
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
@@ -220,9 +220,15 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
                 else _CLEARLY.format(seen)
             )
             comments[f"{name}[k-{nk}]" if nk else f"{name}[k]"] = why
-    for output in outputs:
+    for number, output in enumerate(outputs):
         own = f"_{output}" if len(outputs) > 1 else ""
         found = [(f"a{i}{own}", f"{output}[k-{i}]") for i in range(1, orders.na + 1)]
+        found += [
+            (f"a{i}_{outputs[j]}{own}", f"{outputs[j]}[k-{i}]")
+            for to, j in model.across
+            if to == number
+            for i in range(1, orders.na + 1)
+        ]
         for name, nb, nk in zip(inputs, orders.nb, orders.nk, strict=True):
             by = f"_{name}" if len(inputs) > 1 else ""
             found += [
@@ -604,7 +610,12 @@ def _account(
                 "held out"
             )
     horizon = "one step ahead" if not roles.inputs else "in free run"
-    physics = f"linear, {model.orders}{', with a constant' if model.offset else ''}"
+    names = channel_names(roles.outputs)
+    others = {names[i]: [names[j] for to, j in model.across if to == i] for i in dict(model.across)}
+    past = "".join(
+        f", {name} with the past of {join_words(own)} too" for name, own in others.items()
+    )
+    physics = f"linear, {model.orders}{', with a constant' if model.offset else ''}{past}"
     if errors is None:
         errors = model.free_run
         where = f"the last {percent(1 - FITTED)} of rows 0 to {cut}, fitted to those before"

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -39,6 +39,11 @@ _TELLING = 0.7  # error over the output's deviation, from which on a free run ra
 _RESTARTED = (300, 100, 30, 10)  # rows after which a run is started again where longer ones do not
 _DYNAMIC = 0.25  # of the error without past outputs, below which runs with them are believed
 
+_TOGETHER = 8_000  # rows that outputs with each other's past are looked at on
+_COUPLED = 0.9  # of the error without it, below which the past of other outputs is believed
+_ROUNDS = 3  # times that instruments refine a fit of all outputs
+
+Pair: TypeAlias = tuple[int, int]
 _Choice: TypeAlias = tuple[float, Orders, tuple[float, ...]]
 """The least error of all orders, the smallest orders near it, and their error of each output."""
 
@@ -60,6 +65,8 @@ class FirstModel:
     """
     restarted: int | None = None
     """Rows after which those runs start again from measured lags; None for one long run."""
+    across: tuple[Pair, ...] = ()
+    """Pairs (i, j) of outputs: output i has the past of output j, too."""
 
 
 def first_model(record: Record) -> FirstModel | None:
@@ -81,7 +88,157 @@ def first_model(record: Record) -> FirstModel | None:
     chosen, restarted = _telling(record, excited, first_lags)
     if chosen is None:
         return None
-    return FirstModel(chosen[1], offset, delays, excited, chosen[2], restarted)
+    across, chosen = _coupled(record, excited, chosen, restarted)
+    return FirstModel(chosen[1], offset, delays, excited, chosen[2], restarted, across)
+
+
+def _coupled(
+    record: Record, excited: tuple[int, ...], chosen: _Choice, length: int | None
+) -> tuple[tuple[Pair, ...], _Choice]:
+    """Return the pairs of outputs of which one follows the other's past, and their choice.
+
+    None where that does not clearly lower the error of the free run. Pairs go one by one while the
+    error hardly grows.
+    """
+    ny = len(record.outputs)
+    every = tuple((i, j) for i in range(ny) for j in range(ny) if i != j)
+    if not every or not record.inputs:
+        return (), chosen
+    if len(record) > _TOGETHER:
+        record = witness(RecordSource(record, 0), _TOGETHER)
+    nk, tried = chosen[1].nk, []
+    for na, n in product(range(1, _MOST + 1), range(1, _MOST + 1)):
+        orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
+        errors = _errors_together(record, orders, every, length)
+        if errors is not None:
+            tried.append((float(np.mean(errors)), orders.size, orders, errors))
+    if not tried:
+        return (), chosen
+    least = min(error for error, *_ in tried)
+    if least > _COUPLED * chosen[0]:
+        return (), chosen
+    near = [one for one in tried if one[0] <= max(_AS_GOOD * least, _EXACT)]
+    _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
+    pairs = every
+    for pair in every:
+        fewer = tuple(one for one in pairs if one != pair)
+        without = _errors_together(record, orders, fewer, length)
+        if without is not None and np.mean(without) <= max(_AS_GOOD * least, _EXACT):
+            pairs, errors = fewer, without
+    return pairs, (least, orders, errors)
+
+
+def _errors_together(
+    record: Record, orders: Orders, pairs: Sequence[Pair], length: int | None
+) -> tuple[float, ...] | None:
+    """Return the error of the free run of all outputs on the last rows, as `_errors`."""
+    first = _first_row(orders)
+    usable = [e for e in record.experiments if len(e) > first + 1]
+    if length is not None:
+        usable = [piece for e in usable for piece in _cut(e, first, length)]
+    rows = sum(len(e) - first for e in usable)
+    cut = int(FITTED * rows)
+    columns = orders.na * len(record.outputs) + sum(orders.nb) + 1
+    if cut < 2 * columns or rows - cut < 2:
+        return None
+    theta = _fit_together(usable, orders, pairs, cut, constant=True)
+    if theta is None:
+        return None
+    y = np.concatenate([e.outputs[first:] for e in usable])
+    run = np.concatenate([_run_together(e, orders, theta) for e in usable])
+    with np.errstate(all="ignore"):
+        wrong = np.sqrt(np.mean((run[cut:] - y[cut:]) ** 2, axis=0))
+    if not np.isfinite(wrong).all():
+        return None
+    return tuple((wrong / np.maximum(y.std(axis=0), 1e-300)).tolist())
+
+
+def _fit_together(
+    experiments: Sequence[Experiment],
+    orders: Orders,
+    pairs: Sequence[Pair],
+    cut: int | None,
+    *,
+    constant: bool,
+    refine: bool = True,
+) -> Matrix | None:
+    """Return θ (columns, ny) of all outputs by least squares on the first `cut` rows.
+
+    Refined by instruments, the outputs of the free run, while that lowers its error there. None
+    where the columns have not full rank.
+    """
+    first = _first_row(orders)
+    y = np.concatenate([e.outputs[first:] for e in experiments])[:cut]
+    phi = np.concatenate([_rows_together(e, orders) for e in experiments])[:cut]
+    kept = _columns_together(y.shape[1], orders, pairs)
+    kept[-1] &= constant
+    scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    z, best, least = phi, None, np.inf
+    for _ in range(1 + _ROUNDS * refine):
+        theta = np.zeros(kept.shape)
+        for j in range(y.shape[1]):
+            own = kept[:, j]
+            system = (z[:, own] / scale[own]).T @ (phi[:, own] / scale[own])
+            if not np.isfinite(system).all() or np.linalg.cond(system) > 1 / _RANK**2:
+                return best
+            right = (z[:, own] / scale[own]).T @ y[:, j]
+            theta[own, j] = np.linalg.solve(system, right) / scale[own]
+        runs = [_run_together(e, orders, theta) for e in experiments]
+        with np.errstate(all="ignore"):
+            square = float(np.mean(((np.concatenate(runs)[:cut] - y) / y.std(axis=0)) ** 2))
+        if best is not None and not square < least:
+            break
+        best, least = theta, square
+        if not np.isfinite(square):
+            break
+        modelled = []
+        for e, run in zip(experiments, runs, strict=True):
+            outputs = e.outputs.copy()
+            outputs[first:] = run
+            modelled.append(_rows_together(replace(e, outputs=outputs), orders))
+        z = np.concatenate(modelled)[:cut]
+    return best
+
+
+def _columns_together(ny: int, orders: Orders, pairs: Sequence[Pair]) -> Any:
+    """Return which columns (columns, ny) of `_rows_together` each output has."""
+    other = orders.na * ny + sum(orders.nb) + 1
+    kept = np.ones((other, ny), dtype=bool)
+    for lag in range(orders.na):
+        for i in range(ny):
+            for j in range(ny):
+                kept[lag * ny + j, i] = i == j or (i, j) in pairs
+    return kept
+
+
+def _rows_together(e: Experiment, orders: Orders) -> Matrix:
+    """Return the rows of the past of all outputs, lag by lag, of the inputs, and 1."""
+    first, ny = _first_row(orders), e.outputs.shape[1]
+    count = len(e) - first
+    past = [
+        e.outputs[first - i : first - i + count, j]
+        for i in range(1, orders.na + 1)
+        for j in range(ny)
+    ]
+    driven = _rows(e, 0, replace(orders, na=0), first)
+    return np.column_stack([*past, driven]) if past else driven
+
+
+def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
+    """Return the free run of all outputs from their first measured rows on."""
+    first, ny = _first_row(orders), e.outputs.shape[1]
+    past = orders.na * ny
+    driven = _rows(e, 0, replace(orders, na=0), first) @ theta[past:]
+    along = theta[:past].T.copy()
+    state = e.outputs[first - orders.na : first][::-1].reshape(-1).copy()
+    run = np.empty((len(driven), ny))
+    with np.errstate(all="ignore"):
+        for k, push in enumerate(driven):
+            row = along @ state + push
+            run[k] = row
+            state[ny:] = state[:-ny]
+            state[:ny] = row
+    return run
 
 
 def _telling(
@@ -303,6 +460,16 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
     fitted, tested = ([e for e in r.experiments if len(e) > first] for r in (train, test))
     if not tested or not fitted:
         return None
+    if model.across:
+        constant = {"constant": model.offset, "refine": False}
+        together = _fit_together(fitted, orders, model.across, None, **constant)
+        if together is None:
+            return None
+        run = np.concatenate([_run_together(e, orders, together) for e in tested])
+        measured = np.concatenate([e.outputs[first:] for e in tested])
+        with np.errstate(all="ignore"):
+            errors = np.sqrt(np.mean((run - measured) ** 2, axis=0)) / measured.std(axis=0)
+        return tuple(errors.tolist()) if np.isfinite(errors).all() else None
     for j in range(len(train.outputs)):
         phi = np.concatenate([_rows(e, j, orders, first) for e in fitted])
         y = np.concatenate([e.outputs[first:, j] for e in fitted])
