@@ -963,3 +963,32 @@ def test_a_time_that_begins_anew_separates_experiments(tmp_path):
     assert "the time begins anew in row 120: the rows between are experiments" in done.out
     data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
     assert (data["sampling_time"], data["train"]["rows"]) == (0.5, [[0, 120], [120, 225]])
+
+
+@pytest.mark.parametrize("name", ["part", "id"])
+def test_a_column_that_numbers_the_experiments_is_no_input(tmp_path, name):
+    """By its name, or since the time begins anew with it; it was taken for an input."""
+    u, y = plant(300)
+    half = 0.5 * np.arange(150)
+    time = half if name == "part" else half + 75.0 * np.arange(2)[:, None]
+    number = np.repeat([1, 2], 150)
+    frame = pd.DataFrame({name: number, "t": np.broadcast_to(time, (2, 150)).ravel()})
+    frame.assign(u=u, y=y).to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert (data["inputs"], data["outputs"], data["experiment"]) == (["u"], ["y"], name)
+
+
+def test_an_input_that_rises_in_whole_steps_is_an_input(tmp_path):
+    u = np.repeat(np.arange(1.0, 7.0), 50)
+    y = np.zeros(300)
+    for k in range(1, 300):
+        y[k] = 0.9 * y[k - 1] + 0.1 * u[k - 1]
+    y += 0.01 * np.random.default_rng(0).normal(size=300)
+    frame = pd.DataFrame({"t": 0.5 * np.arange(300), "force": u, "position": y})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    assert data["inputs"] == ["force"] and "experiment" not in data

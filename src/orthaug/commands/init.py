@@ -29,6 +29,7 @@ from orthaug.physics.systems import System
 from orthaug.selection.first_orders import (
     FITTED,
     LOOKED_AT,
+    MOST_DELAY,
     FirstModel,
     first_model,
     free_run_errors,
@@ -647,7 +648,12 @@ def _account(
 def _delay(delay: int | None) -> str:
     if delay is None:
         return "no lag of it is significant"
-    return f"beside the outputs' past it is first significant at lag {delay}"
+    last = (
+        ", the largest that is tried: the true one may be later, or earlier where it acts weakly"
+        if delay >= MOST_DELAY
+        else ""
+    )
+    return f"beside the outputs' past it is first significant at lag {delay}{last}"
 
 
 def _order(order: int) -> str:

@@ -20,6 +20,11 @@ from orthaug.data.variables import ENDINGS
 
 _MOST_EXPERIMENTS = 50  # that a column of the file may number
 _SHORTEST_EXPERIMENT = 20  # rows
+# Names of a column that numbers the experiments
+_NUMBERING = frozenset(
+    ("id", "experiment", "exp", "run", "run_id", "trial", "test", "batch", "cycle", "session")
+    + ("versuch", "lauf", "messung", "nr", "no")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +41,9 @@ class Survey:
     def signals(self) -> tuple[Column, ...]:
         """Columns that could be channels: their numbers vary and are not time."""
         apart = [self.clock.column, *(one.column for one in self.clock.refused if not one.signal)]
+        number = self.experiment_column(())
+        if number is not None and self._says_so(number):
+            apart.append(number)
         found = [c for c in self.columns if not c.unusable and not c.constant]
         return tuple(c for c in found if not any(c is one for one in apart))
 
@@ -69,6 +77,14 @@ class Survey:
             if several and apart and min(map(len, blocks)) >= _SHORTEST_EXPERIMENT:
                 return column
         return None
+
+    def _says_so(self, number: Column) -> bool:
+        """Return whether a column numbers experiments by its name, or by where the time restarts.
+
+        An input may rise in steps of whole numbers, too.
+        """
+        begins = (np.flatnonzero(np.diff(number.values[: number.filled])) + 1).tolist()
+        return number.name.lower() in _NUMBERING or begins == list(self.clock.restarts)
 
     def same_lengths(self, columns: Sequence[Column]) -> bool:
         """Return whether columns belong to one run.

@@ -31,7 +31,8 @@ _RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
 _EXACT = 1e-4  # of the output's deviation: below, more lags follow the rounding
-_DELAY = 20  # the largest delay that is looked for
+MOST_DELAY = 20
+"""The largest delay that is looked for."""
 _PER_DELAY = 6  # rows of the longest experiment at least
 _SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
@@ -316,7 +317,7 @@ def first_significant_lag(record: Record, number: int) -> int | None:
     """
     record = _spread_windows(record)
     longest = max(map(len, record.experiments))
-    found, most = [], max(_MOST, min(_DELAY, longest // _PER_DELAY))
+    found, most = [], max(_MOST, min(MOST_DELAY, longest // _PER_DELAY))
     long = tuple(e for e in record.experiments if len(e) > 2 * most)
     for j, output in enumerate(record.outputs if long else ()):
         one = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
