@@ -35,6 +35,7 @@ from orthaug import (
 from orthaug.analysis.imitation import imitation
 from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
+from orthaug.inference.nearly_shared import output_warnings
 from orthaug.physics.left_over import left_over
 from orthaug.physics.problem import pose
 from orthaug.physics.shared import SharedDirections, shared_directions
@@ -551,3 +552,38 @@ def test_a_motion_asks_the_rows_too():
         assert fit.learns and fit.shared.rest is not None
         assert ("e" in fit.shared.on_data) == shared, fit.shared.rest.share
         assert not {"m", "k"} & set(fit.shared.on_data)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "learned", "named"),
+    [
+        ("(force - c*v)/m", False, True),
+        ("drag + force/m", False, True),
+        ("(force - c*v)/m", True, False),
+        ("force - g", False, False),
+        ("v", False, False),
+    ],
+)
+def test_an_output_with_the_parameters_of_a_learned_equation_needs_a_learner(
+    acceleration, learned, named
+):
+    """Tyres that saturate were learned in the equations of motion, not in the measured acceleration."""
+    motion = oa.Motion.from_equations(
+        [oa.State("v", "(force - c*v)/m", start=0.0, learned=True), oa.State("x", "v + 0*g")],
+        [oa.Output("x", "x"), oa.Output("a", f"{acceleration} + 0*v", learned=learned)],
+        [oa.PhysicalParameter(name, 1.0) for name in ("m", "c", "g")],
+        ["force"],
+        define={"drag": "-c*v/m"},
+    )
+    found = output_warnings(motion)
+    assert [one.code for one in found] == ["output_without_learner"] * named
+    assert not named or "a has the parameters m and c" in found[0].text
+    assert not output_warnings(PLAIN)
+
+
+PLAIN = oa.Motion.from_equations(
+    [oa.State("v", "(force - c*v)/m", start=0.0)],
+    [oa.Output("v", "v"), oa.Output("a", "(force - c*v)/m + 0*v")],
+    [oa.PhysicalParameter(name, 1.0) for name in ("m", "c")],
+    ["force"],
+)

@@ -32,7 +32,7 @@ from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.inference.measures import WeighedPhysics, weigh_problem
-from orthaug.inference.nearly_shared import shared_warnings
+from orthaug.inference.nearly_shared import output_warnings, shared_warnings
 from orthaug.models.learners import learns
 from orthaug.models.response import Response
 
@@ -104,7 +104,8 @@ def imitable(fit: Estimate, evidence: Evidence) -> tuple[Imitation | None, list[
         found = found.with_memory(
             form, fit.theta, *np.split(fit.reach(first), [form.states], axis=1)
         )
-    return found, shared_warnings(fit.shared, seen)
+    warnings = [*shared_warnings(fit.shared, seen), *output_warnings(form.motion)]
+    return found, warnings
 
 
 def imitable_before(

@@ -142,7 +142,10 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.states.{state}": {key: f"({late.input} - {state})/{name}", "start": first},
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
-        return change, f"a lag of {late.input} (the state {state}, time constant {name})"
+        words = f"a lag of {late.input} (the state {state}, time constant {name}"
+        if not late.by_lag:
+            words += '; a dead time, by step = "shift" of data.prepare, fits physics alone better'
+        return change, f"{words})"
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:
@@ -197,7 +200,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.analysis.other_solutions import find_other_solution
         from orthaug.fitting.motion_task import restart_warnings
         from orthaug.fitting.segmented_motion import SegmentedMotion
-        from orthaug.inference.nearly_shared import shared_warnings
+        from orthaug.inference.nearly_shared import output_warnings, shared_warnings
         from orthaug.inference.splitting import shared_of_motion
         from orthaug.models.learners import nothing_learned
         from orthaug.models.moving import MotionDynamics
@@ -228,6 +231,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             shared = imitation_before(form, *run, segmented.segments.steps)
             seen = [str(entry) for entry in form.features]
             on_rows = shared_warnings(shared_of_motion(form, *run), seen)
+            on_rows += output_warnings(motion)
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
         trial = try_holds(posed, criterion, solver, structure, waves)
         text, warnings = _about_steps(problem, trial)

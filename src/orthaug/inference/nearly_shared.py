@@ -13,8 +13,9 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent
+from orthaug._base.lines import join_words, percent
 from orthaug.models.statistics import JointCovariance, Statistics
+from orthaug.physics.motion import Motion
 from orthaug.physics.shared import SharedDirections
 
 # share of a direction's squares below which it is split off, and has the variance of the split
@@ -107,3 +108,30 @@ def shared_warnings(shared: SharedDirections | None, inputs: Sequence[str]) -> l
         )
         found.append(Warning("little_left", text))
     return found
+
+
+def output_warnings(motion: Motion) -> tuple[Warning, ...]:
+    """Return a warning on outputs that have parameters of an equation with a learner, but no own.
+
+    A measured acceleration is that: what its equation lacks is missing in the output, too.
+    """
+    states, outputs = motion.learned
+    if motion.functions is not None or not states:
+        return ()
+    learned = {name for i in states for name in motion.parameters_in(motion.names_of_states[i])}
+    uses = {}
+    for i, output in enumerate(motion.outputs):
+        own = [name for name in motion.parameters_of_output(i) if name in learned]
+        if own and i not in outputs:
+            uses[output.name] = own
+    if not uses:
+        return ()
+    names = [*dict.fromkeys(name for own in uses.values() for name in own)]
+    have = "has" if len(uses) == 1 else "have"
+    text = (
+        f"{join_words(list(uses))} {have} the parameters {join_words(names)} of equations with a "
+        "learner, but no learner. What the physics lacks there is missing in the output as well, "
+        "and moves these parameters; their intervals do not count it. Give the output a learner, "
+        "too (`learned = true`)."
+    )
+    return (Warning("output_without_learner", text),)

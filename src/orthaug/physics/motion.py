@@ -383,6 +383,11 @@ class Motion(NotebookView):
         there = self._names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
+    def parameters_of_output(self, i: int) -> tuple[str, ...]:
+        """Return the parameters in output i's expression, for a motion with expressions."""
+        there = self._names_in(self.observations[i])
+        return tuple(name for name in self.names if name in there)
+
     @property
     def names_of_states(self) -> tuple[str, ...]:
         """Names of x in order."""
