@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import orthaug as oa
 from orthaug import (
     MLP,
     Additive,
@@ -614,3 +615,21 @@ def test_shares_are_told_of_the_output_that_follows_something():
     assert _shares(seen).startswith(
         "The predictable share of its variance of T is 0 %"
     ) and "0 K at most" in _shares(seen)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.0])
+def test_noise_in_the_measured_start_is_no_drift(noise):
+    """The right physics of a slow plant was called unmodelled, since its free run began at noisy rows."""
+    rng = np.random.default_rng(4)
+    u, y = np.repeat(rng.uniform(-1, 1, 30), 40), np.zeros(1200)
+    for k in range(2, 1200):
+        y[k] = 1.97 * y[k - 1] - 0.9705 * y[k - 2] + 5e-4 * u[k - 1]
+    record = oa.Record.from_arrays(u, y + noise * rng.normal(size=1200), sampling_time=1.0)
+    lags = {"a1": "y[k-1]", "a2": "y[k-2]", "b": "u[k-1]"}
+    physics = oa.Baseline.from_terms([oa.Term(*term) for term in lags.items()])
+    fit = oa.estimate(record, physics, learner=None, criterion=oa.Simulation())
+    found = oa.diagnose(fit)
+    named = [one.code for one in found.warnings] if found is not None else []
+    assert "drift" not in named
+    assert (noise > 0) == ("noisy_start" in named)
+    assert not noise or found.verdict == "sensor_noise"

@@ -20,6 +20,10 @@ from orthaug.data.record import Record
 from orthaug.fitting.whiteness import LARGEST
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
+from orthaug.models.response import Response
+
+_MOST_ROWS = 20_000  # of a record whose free run is made again from other lags
+_LEAST = 1e-10  # singular value over the largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +99,37 @@ def linear_runs(model: Model, record: Record, most: int, theta: Vector) -> list[
             return None
         runs.append(run)
     return runs or None
+
+
+def from_fitted_start(model: Model, record: Record, free_run: Response) -> Response | None:
+    """Return a free run from the lags that follow the outputs best, to first order.
+
+    None where the record is long, an experiment short, or the run has no slopes.
+
+    Args:
+        free_run: over the record, from the measured lags.
+    """
+    if len(record) > _MOST_ROWS or len(record.experiments) != len(free_run.trajectories):
+        return None
+    runs = linear_runs(model, record, _MOST_ROWS, np.asarray(model.numbers.theta, dtype=float))
+    if runs is None or len(runs) != len(record.experiments):
+        return None
+    found = []
+    for run, trajectory in zip(runs, free_run.trajectories, strict=True):
+        followed = run.starts()
+        t, ny, n0 = followed.shape
+        if t <= 2 * n0 or len(trajectory.errors) != t or not np.isfinite(followed).all():
+            return None
+        columns, error = followed.reshape(t * ny, n0), trajectory.errors.reshape(-1)
+        step = np.linalg.lstsq(columns, error, rcond=_LEAST)[0]
+        baseline = trajectory.baseline.copy()
+        baseline[trajectory.start :] += (columns @ step).reshape(t, ny)
+        whole = trajectory.whole
+        if whole is not None:
+            whole = whole.copy()
+            whole[trajectory.start :] += (columns @ step).reshape(t, ny)
+        found.append(replace(trajectory, baseline=baseline, whole=whole))
+    return replace(free_run, trajectories=tuple(found))
 
 
 def _linearize(
