@@ -105,6 +105,14 @@ def measured(folder, wrong: str = "", shape: str = "noise") -> None:
     cells = {"u": u, "y": y}
     if wrong == "twice":
         cells = {name: np.repeat(column, 2) for name, column in cells.items()}
+    elif wrong == "again":
+        cells = {
+            name: np.insert(column, [101, 251], column[[100, 250]])
+            for name, column in cells.items()
+        }
+    elif wrong == "coarse":  # many rows repeat the one before by chance
+        cells["y"] = np.round(y, 1)
+        cells["u"] = np.repeat(u[::8], 8)
     elif wrong == "frozen":
         y[100:160] = y[100]
     elif wrong:
@@ -175,7 +183,18 @@ def test_init_names_a_wild_input(tmp_path):
 def test_heavy_tails_steps_and_impulses_are_no_wild_samples(tmp_path, shape):
     measured(tmp_path, shape=shape)
     codes = {warning["code"] for warning in told(tmp_path, SPEC)["warnings"]}
-    assert not codes & {"wild_samples", "rows_twice", "frozen_output"}
+    assert not codes & {"wild_samples", "rows_twice", "frozen_output", "repeated_rows"}
+
+
+def test_rows_of_a_coarse_output_repeat_by_chance(tmp_path):
+    measured(tmp_path, "coarse")
+    assert not text_of(told(tmp_path, SPEC), "repeated_rows")
+
+
+def test_single_rows_that_were_written_twice_are_named(tmp_path):
+    measured(tmp_path, "again")
+    text = text_of(told(tmp_path, SPEC), "repeated_rows")
+    assert "row 101" in text and "row 252" in text and "too late" in text
 
 
 @pytest.mark.parametrize(("wrong", "code"), [("twice", "rows_twice"), ("frozen", "frozen_output")])

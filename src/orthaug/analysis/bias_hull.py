@@ -134,6 +134,8 @@ def undetermined_warning(
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
     causes = " and ".join(f"{c.name} ({percent(c.share)} of what it found)" for c in pair)
+    if len({c.name for c in pair}) == 1:  # of several outputs
+        causes = f"{pair[0].name} in one output and in another"
     of = f": {causes} imply different values" if len(pair) > 1 else ""
     cure = " or ".join(
         remedies

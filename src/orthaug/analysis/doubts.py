@@ -29,6 +29,8 @@ _LISTED = 3  # parameters, and terms with memory
 _NOISE_ONLY = ("unexplained", "parameter_drift")  # warnings that leave intervals of noise alone
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
+_MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judged beside it
+_LITTLE_BESIDE = 0.5  # of that share, which memory must predict
 _LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
 _UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
@@ -68,6 +70,8 @@ def doubt(made: E) -> E:
             )
         )
     hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
+    if test is not None and test.state is not None and _named_share(result) > _MOSTLY:
+        hidden = hidden and test.state.share > _LITTLE_BESIDE * _named_share(result)
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     if test is not None and test.drift is not None and not hidden:
@@ -96,6 +100,12 @@ def _static_share(result: Findings) -> float:
         [one.functions for one in result.residuals.predictable or ()] if result.residuals else []
     )
     return max(shares, default=0.0)
+
+
+def _named_share(result: Findings) -> float:
+    """Return the share of a free run's error that the best simple missing term explains."""
+    missing = result.residuals.missing if result.residuals is not None else None
+    return max((term.share or 0.0 for term in missing.terms), default=0.0) if missing else 0.0
 
 
 def _withdrawal(result: Findings, left: float) -> str:

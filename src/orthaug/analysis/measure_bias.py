@@ -257,6 +257,8 @@ def _by_inputs(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) 
     problem, suspect = terms.problem, cause.suspect
     if suspect.memory is not None:  # a function of the past is one of no inputs of one row
         return
+    if len(problem.outputs) > 1:  # all outputs have these inputs, and lack different things
+        return
     layout, x = problem.layout, problem.rows.x
     now = {str(entry) for entry in problem.features.entries}
     best: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())

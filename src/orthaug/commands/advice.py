@@ -401,7 +401,8 @@ def advise(
         text = (
             "No change of the spec was tried: fitted to fewer rows, the model has an error of "
             f"{_error(before)} of the output's deviation in free run over {rows.where}, instead of "
-            f"{_error(here)}. Trials with so few rows would say little."
+            f"{_error(here)}. The rows before do not determine it, so a comparison there would say "
+            "little."
         )
         return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
     chosen = found[: job.physics.most_trials]

@@ -16,6 +16,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
+from orthaug.data.columns import quantum_of
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -30,6 +31,8 @@ _NAMED = 3
 _FEWEST = 20  # samples of a channel
 _FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
+_REPEATS = 2  # single rows that repeat the one before, at least
+_BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
 
 
@@ -210,7 +213,40 @@ def _repeat_warnings(record: Record) -> list[Warning]:
                     "`every = 2` for these files, with the sampling time of the measurement."
                 )
                 return [Warning("rows_twice", text)]
-    return []
+    return _single_repeats(record)
+
+
+def _single_repeats(record: Record) -> list[Warning]:
+    """Return a warning of single rows that repeat the row before in all channels.
+
+    None where the outputs are recorded so coarsely that this happens by chance.
+    """
+    places, chance, every = [], 0.0, 0
+    for experiment in record.experiments:
+        outputs = experiment.outputs
+        if len(outputs) < _FEWEST or not np.isfinite(outputs).all():
+            continue
+        same = (outputs[1:] == outputs[:-1]).all(axis=1)
+        same &= (experiment.inputs[1:] == experiment.inputs[:-1]).all(axis=1)
+        beside = np.concatenate([[False], same, [False]])
+        places += [
+            experiment.where(int(row) + 1)
+            for row in np.flatnonzero(same & ~beside[:-2] & ~beside[2:])
+        ]
+        every += int(same.sum())
+        spread = np.maximum(np.diff(outputs, axis=0).std(axis=0), 1e-300)
+        quanta = [quantum_of(column) or 0.0 for column in outputs.T]
+        chance += len(outputs) * float(np.prod(np.minimum(np.array(quanta) / spread, 1.0)))
+    if len(places) < _REPEATS or chance > _BY_CHANCE * len(places) or len(places) < every / 2:
+        return []
+    shown = "; ".join(places[:_NAMED])
+    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
+    text = (
+        f"{shown}{more}: the row repeats the one before in all channels. A logger wrote it "
+        "twice, or it did not get a new sample: all later rows then come a step too late, which "
+        "moves the parameters. Take these rows out of the file."
+    )
+    return [Warning("repeated_rows", text)]
 
 
 def _frozen_warnings(record: Record) -> list[Warning]:

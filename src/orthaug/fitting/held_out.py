@@ -227,7 +227,8 @@ def held_out_blocks(record: Record, blocks: int, start: int) -> list[tuple[Recor
             or sum(len(e) - start for e in kept) < _FEWEST
         ):
             raise InputError(
-                f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows."
+                f"{len(record)} rows are too few for {blocks} blocks with gaps of {start} rows; "
+                "give more rows, or fewer blocks."
             )
         folds.append((kept, held))
     least = min(sum(len(e) - start for e in kept) for kept, _ in folds)
