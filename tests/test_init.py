@@ -989,3 +989,24 @@ def test_an_input_that_rises_in_whole_steps_is_an_input(tmp_path):
     frame = pd.DataFrame({"t": 0.5 * np.arange(300), "force": u, "position": y})
     frame.to_csv(tmp_path / "a.csv", index=False)
     assert [one.name for one in survey(tmp_path / "a.csv").signals] == ["force", "position"]
+
+
+@pytest.mark.parametrize(("every", "thinned"), [(1, True), (40, False)])
+def test_rows_far_too_close_are_thinned(tmp_path, every, thinned):
+    """A second of a swinging mass at 1 kHz: its free run drifted, since neighbouring lags hardly differ."""
+    rng = np.random.default_rng(1)
+    force, x, v, out = np.repeat(rng.normal(size=20), 300), 0.0, 0.0, []
+    for f in force:
+        out.append(x)
+        v += 1e-3 * (f - 1.5 * v - 40.0 * x)
+        x += 1e-3 * v
+    y = np.array(out) + 5e-4 * rng.normal(size=len(out))
+    frame = pd.DataFrame({"t": 1e-3 * np.arange(len(y)), "force": force, "x": y})[::every]
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    given = ("--inputs", "force", "--outputs", "x", "--out", tmp_path / "spec.toml")
+    done = run("init", tmp_path / "a.csv", *given)
+    assert done.code == 0, done.err
+    data = tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
+    steps = [one["step"] for one in data.get("prepare", [])]
+    assert steps == ["decimate"] * thinned
+    assert ("rows are thinned by" in done.out) == thinned

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from orthaug.selection.first_orders import (
     FirstModel,
     first_model,
     free_run_errors,
+    restarted_error,
 )
 from orthaug.selection.roles import guess_roles
 
@@ -52,6 +53,8 @@ class Roles:
     outputs: tuple[Column, ...]
     sampling_time: float | None = None
     reason: str = ""
+    thinned: int = 1
+    """Factor by which the rows are thinned, behind a low-pass."""
 
 
 def channel_names(columns: Sequence[Column]) -> list[str]:
@@ -85,6 +88,8 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
         ]
     if time_of(found, roles) and not found.clock.even:
         steps.append(("resample", {"sampling_time": found.clock.step}))
+    if roles.thinned > 1:
+        steps.append(("decimate", {"factor": roles.thinned}))
     return steps
 
 
@@ -259,6 +264,10 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
 Names = str | Sequence[str]  # columns, several in a text separated by commas
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
+_POWER = 0.95  # of an output, within its band
+_CLEARLY_LESS = 0.7  # of the error of a free run: with it fewer rows are taken
+_SHORTEST_RUN = 5  # rows after which runs of fewer rows start again
+_CLOSE = 0.05  # error over the output's deviation: no thinning is looked for below it
 _LISTED = 12  # columns in a message
 
 
@@ -463,6 +472,9 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
             "channels, or the inputs are combinations of each other. Give more rows, or fewer "
             "inputs."
         )
+    whole, measured = model, record
+    if system is None and not missing:
+        roles, record, model = _thinned(found, roles, cut, rows, record, model)
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
         f"{plural(lost, 'training row')} in longer runs of wild samples "
@@ -487,9 +499,66 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
             model,
             errors,
             wild if lost and not missing else "",
-            [w.text for w in data_warnings(record)],
+            [*_thinning(roles, whole, model), *(w.text for w in data_warnings(measured))],
         ),
     )
+
+
+def _thinned(
+    found: Survey, roles: Roles, cut: int, rows: int, record: Record, model: FirstModel
+) -> tuple[Roles, Record, FirstModel]:
+    """Return the roles, the record and its model with fewer rows where that runs clearly better.
+
+    Of outputs that move slowly beside the sampling, neighbouring lags hardly differ: what least
+    squares find in them one step ahead is noise.
+    """
+    best = roles, record, model
+    error, restarted = float(np.mean(model.free_run)), model.restarted
+    factor, rank = _slowness(record), (True, np.inf)
+    for by in sorted({factor // 4, factor // 2, factor}):
+        if by < 2 or rows - cut < _TESTED * by or error < _CLOSE:
+            continue
+        fewer = replace(roles, thinned=by)
+        with suppress(InputError):
+            own = _record(found, fewer, (0, cut), 0)[0]
+            other = first_model(own)
+            if other is None or not record.inputs or (other.restarted and not restarted):
+                continue
+            least = float(np.mean(other.free_run))
+            if restarted is not None:  # as long a time after which runs start again
+                least = restarted_error(own, other, max(restarted // by, _SHORTEST_RUN))
+            placed = bool(other.restarted), float(np.mean(other.free_run))
+            if least < _CLEARLY_LESS * error and placed < rank:
+                best, rank = (fewer, own, other), placed
+    return best
+
+
+def _slowness(record: Record) -> int:
+    """Return the factor by which rows may be thinned: 20 times the band of the outputs is left.
+
+    The band has 95 % of the power of each output.
+    """
+    longest = max(record.experiments, key=len)
+    n, bands = len(longest), []
+    for y in longest.outputs.T:
+        power = np.abs(np.fft.rfft((y - y.mean()) * np.hanning(n))) ** 2
+        share = np.cumsum(power) / max(float(power.sum()), 1e-300)
+        bands.append(max(int(np.searchsorted(share, _POWER)), 1) / n)
+    return int(1 / (20 * max(bands)))
+
+
+def _thinning(roles: Roles, whole: FirstModel, model: FirstModel) -> list[str]:
+    """Return a line on why rows are thinned; none where they are not."""
+    if roles.thinned == 1:
+        return []
+    slow = f"the outputs move slowly beside the sampling: rows are thinned by {roles.thinned}"
+    if whole.restarted:
+        return [f"{slow} (decimate), with which free runs of the same time are clearly better"]
+    errors = [percent(float(np.mean(one.free_run)), 3) for one in (model, whole)]
+    return [
+        f"{slow} (decimate), with which the error of the free run on rows held out is {errors[0]} "
+        f"instead of {errors[1]}"
+    ]
 
 
 def write_spec(found: Draft, out: Path, *, force: bool = False) -> None:

@@ -93,6 +93,18 @@ def first_model(record: Record) -> FirstModel | None:
     return FirstModel(chosen[1], offset, delays, excited, chosen[2], restarted, across)
 
 
+def restarted_error(record: Record, model: FirstModel, length: int) -> float:
+    """Return the mean error of a model's orders over runs that start again after `length` rows.
+
+    Infinite where these are too few, or run away.
+    """
+    if model.across:
+        errors = _errors_together(record, model.orders, model.across, length)
+    else:
+        errors = _errors(record, model.orders, length)
+    return np.inf if errors is None else float(np.mean(errors))
+
+
 def _coupled(
     record: Record, excited: tuple[int, ...], chosen: _Choice, length: int | None
 ) -> tuple[tuple[Pair, ...], _Choice]:
