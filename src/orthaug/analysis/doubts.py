@@ -218,10 +218,16 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     remedy = (
         f"{fit.problem.new_state}; or let the learner see lags or a filtered copy of that signal"
     )
+    driven = best.on in {channel.name for channel in fit.problem.record.inputs}
+    noisy = (
+        f" Noise on the recorded {best.on}, or a value held otherwise between samples, looks alike."
+        if driven
+        else ""
+    )
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
         f"the free run's error on held-out rows{beside}. No function of the model's own states "
-        f"predicts it.{_movement_text(fit, best)} Remedy: {remedy}."
+        f"predicts it.{_movement_text(fit, best)}{noisy} Remedy: {remedy}."
     )
 
 

@@ -41,7 +41,9 @@ _INFLATION = 1.4
 _FOLD_WORK = 2.5e7
 
 
-def fold_solver(solver: Solver, rows: int, parameters: int, *, free_run: bool) -> Solver:
+def fold_solver(
+    solver: Solver, rows: int, parameters: int, *, free_run: bool, taken: int | None = None
+) -> Solver:
     """Return the solver for the fit to a block of cross-validation.
 
     A free run begins at physics alone and may need more iterations than one step ahead until its
@@ -51,8 +53,10 @@ def fold_solver(solver: Solver, rows: int, parameters: int, *, free_run: bool) -
         rows: training rows of the block.
         parameters: of physics and learner together.
         free_run: whether the fit is to the free run.
+        taken: iterations of the runs on all rows: a fold gets no more. None where that is unknown.
     """
     affordable = int(_FOLD_WORK / max(rows * parameters, 1)) if free_run else 0
+    affordable = affordable if taken is None else min(affordable, taken)
     return solver.at_most(max(FOLD_ITERATIONS, affordable))
 
 
@@ -379,7 +383,8 @@ def _held_out(
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
     ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
-    given = (task, list(zip(starts, ridges, strict=True)), structure, solver)
+    taken = max(run.iterations for run in runs)
+    given = (task, list(zip(starts, ridges, strict=True)), structure, solver, taken)
     found = runner.map(_on_fold, given, folds)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(
@@ -394,7 +399,7 @@ def _held_out(
 
 def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
     """Return errors on a block of physics alone, and of runs from every start on the rest."""
-    task, starts, structure, solver = given
+    task, starts, structure, solver, taken = given
     training, held = fold
     failed: Pieces = [None] * len(held.experiments)
     solver = fold_solver(
@@ -402,6 +407,7 @@ def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None
         sum(map(len, training.experiments)),
         len(task.problem.names) + task.bound.size,
         free_run=not task.criterion.one_step,
+        taken=taken,
     )
     try:
         own = task.on(training).prepare(solver, structure)
