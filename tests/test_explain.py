@@ -424,3 +424,18 @@ def test_no_difference_of_two_peaks_is_proposed():
     )
     found = [term.expression for term in oa.explain(fit.model, record).terms]
     assert "a[k]*b[k]" in found and sum("exp(" in text for text in found) < 2
+
+
+@pytest.mark.parametrize("slope", [10.0, 0.0])
+def test_an_end_stop_or_a_limit_of_a_spring_leaves_it_its_stiffness(slope):
+    """Both are the same force beside a spring; the one is named that leaves the spring its stiffness."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(scale=0.7, size=800)
+    beyond = x - np.clip(x, -1.0, 1.0)
+    y = 2.0 * (x - beyond) + slope * beyond + 0.01 * rng.normal(size=800)
+    record = oa.Record.from_arrays(x, y, inputs=["x"], outputs=["force"])
+    spring = oa.Baseline.from_terms([oa.Term("k", "x[k]")])
+    fit = oa.estimate(record, spring, learner=oa.MLP(hidden=(12,), inputs=("x[k]",)))
+    found = oa.explain(fit, record)
+    assert found.terms[0].kind == "dead_zone"
+    assert found.parameters[0].value_with == pytest.approx(2.0, rel=0.05)

@@ -149,6 +149,7 @@ _PART = 0.1  # of what even the best leaves: less does not separate two terms ei
 # Variances of the noise in one direction: what two terms with widths differ by at random
 _DRAWS = 10.0
 _ROUGH, _FINE = 0.03, 1e-3  # of its logarithm
+_SAME_SHARE = 1e-6  # of the learner: terms that explain it equally well
 _TRIED = 10  # kinds of terms, or pairs of kinds, that are refined before the choice
 _BLOCK, _LOOKED = 256, 200  # candidates whose pairs are looked at together, and pairs of them
 _T = 3.0  # standard errors that a coefficient must differ from 0: the term was chosen among many
@@ -532,6 +533,38 @@ def settle_terms(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate]
         chosen, dropped = chosen[:weak] + chosen[weak + 1 :], True
         fit = fit_terms(space, chosen)
     return chosen, fit, dropped
+
+
+_TWINS = {"saturation": "dead_zone", "dead_zone": "saturation"}
+"""Kinds whose terms of one width add up to their variable, so that either stands for the other."""
+
+
+def nearest_twins(space: Space, chosen: list[Candidate], fit: Fit) -> tuple[list[Candidate], Fit]:
+    """Return the terms with those of saturation and dead zone that move the physics least.
+
+    Beside a spring an end stop is a dead zone, whose coefficient is the stop's stiffness, or a
+    saturation that takes the stop from a spring as stiff: the same force, and another k.
+    """
+    for i, one in enumerate(chosen):
+        if one.kind not in _TWINS or one.width is None:
+            continue
+        twin = replace(one, kind=_TWINS[one.kind]).wide(one.width)
+        other = [*chosen[:i], twin, *chosen[i + 1 :]]
+        if abs(_share(space, other) - _share(space, chosen)) > _SAME_SHARE:
+            continue
+        there = fit_terms(space, other)
+        if _movement(space, there) < _movement(space, fit):
+            chosen, fit = other, there
+    return chosen, fit
+
+
+def _movement(space: Space, fit: Fit) -> float:
+    """Return by how much the parameters move, in logarithms; infinite where a sign changes."""
+    now = np.asarray(space.linearization.values, dtype=float)
+    then = np.asarray(space.linearization.moved(fit.along), dtype=float)
+    known = (now != 0) & np.isfinite(now) & np.isfinite(then)
+    ratio = then[known] / now[known]
+    return float(np.sum(np.abs(np.log(ratio)))) if (ratio > 0).all() else np.inf
 
 
 def rivals(

@@ -29,6 +29,7 @@ from orthaug.selection.explaining import (
     Fit,
     Space,
     candidates_of,
+    nearest_twins,
     rivals,
     select,
     settle_terms,
@@ -396,6 +397,7 @@ def explain(
         ),
     )
     chosen, fitted, dropped = settle_terms(space, select(space, most, least))
+    chosen, fitted = nearest_twins(space, chosen, fitted)
     explanation = _explanation(space, chosen, fitted, dropped)
     code = getattr(getattr(fit, "status", None), "code", "converged")
     if code not in _ENDED:
