@@ -1010,3 +1010,23 @@ def test_rows_far_too_close_are_thinned(tmp_path, every, thinned):
     steps = [one["step"] for one in data.get("prepare", [])]
     assert steps == ["decimate"] * thinned
     assert ("rows are thinned by" in done.out) == thinned
+
+
+def test_under_feedback_no_input_acts_in_its_own_row(tmp_path):
+    """The controller's own way from output to input was taken for the plant, without past outputs."""
+    rng = np.random.default_rng(3)
+    reference = np.repeat(rng.uniform(-1, 1, 30), 40)
+    y, u = np.zeros(1200), np.zeros(1200)
+    for k in range(1200):
+        if k > 1:
+            y[k] = 2.02 * y[k - 1] - 1.018 * y[k - 2] + 0.02 * u[k - 1] + 0.002 * rng.normal()
+        u[k] = 6.0 * (reference[k] - y[k]) - 40.0 * (y[k] - y[k - 1] if k else 0.0)
+    frame = pd.DataFrame({"t": 0.01 * np.arange(1200), "u": u, "y": y})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 0, done.err
+    assert "past outputs predict u: the data were probably recorded under feedback" in unfolded(
+        done.out
+    )
+    regressors = re.findall(r'regressor = "(.*?)"', (tmp_path / "spec.toml").read_text())
+    assert "u[k]" not in regressors and "y[k-2]" in regressors

@@ -15,6 +15,7 @@ import tomlkit
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
 from orthaug._base.lines import first_words, join_words, percent, plural
+from orthaug.analysis.closed_loop import Feedback, feedback_in
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
@@ -266,6 +267,7 @@ TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
 _POWER = 0.95  # of an output, within its band
 _CLEARLY_LESS = 0.7  # of the error of a free run: with it fewer rows are taken
+_LOST = 10.0  # error over the output's deviation, of a free run that leaves it
 _SHORTEST_RUN = 5  # rows after which runs of fewer rows start again
 _CLOSE = 0.05  # error over the output's deviation: no thinning is looked for below it
 _LISTED = 12  # columns in a message
@@ -465,7 +467,8 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
     cut = round(TRAINED * rows)
     cut = cut if rows - cut >= _TESTED else rows
     record, lost = _record(found, roles, (0, cut), missing)
-    model = first_model(record)
+    fed = feedback_in(record)
+    model = first_model(record, direct=not fed)
     if model is None:
         raise InputError(
             f"{found.path}: {len(record)} usable rows are too few for a first model of these "
@@ -474,7 +477,7 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
         )
     whole, measured = model, record
     if system is None and not missing:
-        roles, record, model = _thinned(found, roles, cut, rows, record, model)
+        roles, record, model = _thinned(found, roles, cut, rows, record, model, direct=not fed)
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
         f"{plural(lost, 'training row')} in longer runs of wild samples "
@@ -499,13 +502,24 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
             model,
             errors,
             wild if lost and not missing else "",
-            [*_thinning(roles, whole, model), *(w.text for w in data_warnings(measured))],
+            [
+                *_thinning(roles, whole, model),
+                *_feedback(fed),
+                *(w.text for w in data_warnings(measured)),
+            ],
         ),
     )
 
 
 def _thinned(
-    found: Survey, roles: Roles, cut: int, rows: int, record: Record, model: FirstModel
+    found: Survey,
+    roles: Roles,
+    cut: int,
+    rows: int,
+    record: Record,
+    model: FirstModel,
+    *,
+    direct: bool,
 ) -> tuple[Roles, Record, FirstModel]:
     """Return the roles, the record and its model with fewer rows where that runs clearly better.
 
@@ -521,7 +535,7 @@ def _thinned(
         fewer = replace(roles, thinned=by)
         with suppress(InputError):
             own = _record(found, fewer, (0, cut), 0)[0]
-            other = first_model(own)
+            other = first_model(own, direct=direct)
             if other is None or not record.inputs or (other.restarted and not restarted):
                 continue
             least = float(np.mean(other.free_run))
@@ -545,6 +559,17 @@ def _slowness(record: Record) -> int:
         share = np.cumsum(power) / max(float(power.sum()), 1e-300)
         bands.append(max(int(np.searchsorted(share, _POWER)), 1) / n)
     return int(1 / (20 * max(bands)))
+
+
+def _feedback(found: Sequence[Feedback]) -> list[str]:
+    """Return a line on inputs that follow past outputs; none where no input does."""
+    if not found:
+        return []
+    names = join_words([one.name for one in found])
+    return [
+        f"past outputs predict {names}: the data were probably recorded under feedback, which "
+        "`orthaug check` explains. No input acts in its own row, for that is the controller's way"
+    ]
 
 
 def _thinning(roles: Roles, whole: FirstModel, model: FirstModel) -> list[str]:
@@ -693,7 +718,9 @@ def _account(
         where = f"rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
     shown = ", ".join(percent(error, 3) for error in errors)
     lines.append(
-        f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
+        f"first physics: {physics}; its free run leaves the outputs on {where}"
+        if max(errors) > _LOST
+        else f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
         f"deviation on {where}"
     )
     if model.restarted is not None:

@@ -70,7 +70,7 @@ class FirstModel:
     """Pairs (i, j) of outputs: output i has the past of output j, too."""
 
 
-def first_model(record: Record) -> FirstModel | None:
+def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     """Return delays, excitation and orders for a record; None for too few rows.
 
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
@@ -78,6 +78,10 @@ def first_model(record: Record) -> FirstModel | None:
     again from measured lags decide: the longest whose best follows the output. The first lags are
     the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model
     that is tried has a constant: without one, further lags make up for the level of the signals.
+
+    Args:
+        direct: whether an input may act in its own row. Under feedback the controller makes that
+            connection: the input follows the output of the row.
     """
     record = _spread_windows(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
@@ -85,8 +89,12 @@ def first_model(record: Record) -> FirstModel | None:
     delays = tuple(first_significant_lag(record, i) for i in range(len(record.inputs)))
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
-    first_lags = [*dict.fromkeys([*usual, *((late,) * len(delays) for late in (1, 0))])]
-    chosen, restarted = _telling(record, excited, first_lags)
+    first_lags = [*usual, *((late,) * len(delays) for late in (1, 0))]
+    if not direct:
+        delays = tuple(None if delay is None else max(delay, 1) for delay in delays)
+        first_lags = [tuple(max(lag, 1) for lag in lags) for lags in first_lags]
+    first_lags = [*dict.fromkeys(first_lags)]
+    chosen, restarted = _telling(record, excited, first_lags, 0 if direct else 1)
     if chosen is None:
         return None
     across, chosen = _coupled(record, excited, chosen, restarted)
@@ -255,20 +263,25 @@ def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
 
 
 def _telling(
-    record: Record, excited: tuple[int, ...], first_lags: Sequence[tuple[int, ...]]
+    record: Record, excited: tuple[int, ...], first_lags: Sequence[tuple[int, ...]], least: int
 ) -> tuple[_Choice | None, int | None]:
     """Return the choice of the longest runs that follow the output, and after what they restart.
 
     One without past outputs may win among runs that drift: it stays where runs of 100 rows confirm
     it.
     """
-    whole = _best_choice(record, excited, first_lags, None)
+    whole = _best_choice(record, excited, first_lags, None, least)
+    if whole is None:  # under feedback none may be bounded
+        for length in _RESTARTED if record.inputs else ():
+            tried = _best_choice(record, excited, first_lags, length, least)
+            if tried is not None:
+                return tried, length
     if whole is None or not record.inputs or (whole[0] < _TELLING and whole[1].na):
         return whole, None
     static = whole[0] < _TELLING
     best: tuple[_Choice, int | None] = (whole, None)
     for length in _RESTARTED[:2] if static else _RESTARTED:
-        tried = _best_choice(record, excited, first_lags, length)
+        tried = _best_choice(record, excited, first_lags, length, least)
         if tried is None:
             break
         if tried[0] < (_DYNAMIC * whole[0] if static else _TELLING):
@@ -283,25 +296,26 @@ def _best_choice(
     excited: tuple[int, ...],
     first_lags: Sequence[tuple[int, ...]],
     length: int | None,
+    least: int,
 ) -> _Choice | None:
     """Return the smallest orders near the best, from the first lags that are clearly better."""
     chosen: _Choice | None = None
     for nk in first_lags:  # a test may miss them
-        found = _smallest(record, excited, nk, length)
+        found = _smallest(record, excited, nk, length, least)
         if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
             chosen = found
     return chosen
 
 
 def _smallest(
-    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], length: int | None
+    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], length: int | None, least_na: int
 ) -> _Choice | None:
     """Return the least error of all orders from these first lags on, and the smallest near it.
 
     The error of the smallest orders comes with them.
     """
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
-    for na, n in product(range(_MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
+    for na, n in product(range(least_na, _MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
         errors = _errors(record, orders, length)
         if errors is not None and orders.size:
