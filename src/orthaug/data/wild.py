@@ -32,6 +32,7 @@ _FEWEST = 20  # samples of a channel
 _FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
 _REPEATS = 2  # single rows that repeat the one before, at least
+_MOVING = 0.01  # of the deviation of its steps: by less an output rests
 _BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
 
@@ -228,13 +229,15 @@ def _single_repeats(record: Record) -> list[Warning]:
             continue
         same = (outputs[1:] == outputs[:-1]).all(axis=1)
         same &= (experiment.inputs[1:] == experiment.inputs[:-1]).all(axis=1)
-        beside = np.concatenate([[False], same, [False]])
+        spread = np.maximum(np.diff(outputs, axis=0).std(axis=0), 1e-300)
+        # At rest a row repeats the one before, too
+        moves = (np.abs(np.diff(outputs, axis=0)) > _MOVING * spread).any(axis=1)
+        beside = np.concatenate([[False], moves, [False]])
         places += [
             experiment.where(int(row) + 1)
-            for row in np.flatnonzero(same & ~beside[:-2] & ~beside[2:])
+            for row in np.flatnonzero(same & beside[:-2] & beside[2:])
         ]
         every += int(same.sum())
-        spread = np.maximum(np.diff(outputs, axis=0).std(axis=0), 1e-300)
         quanta = [quantum_of(column) or 0.0 for column in outputs.T]
         chance += len(outputs) * float(np.prod(np.minimum(np.array(quanta) / spread, 1.0)))
     if len(places) < _REPEATS or chance > _BY_CHANCE * len(places) or len(places) < every / 2:
