@@ -1,10 +1,10 @@
 """How often is the truth outside every interval that is shown, and nothing warns of it? One table of all such trials.
 
-Five files have the systems: what a missing term moves (`coverage_causes`), columns that a learner could imitate
+Six files have the systems: what a missing term moves (`coverage_causes`), columns that a learner could imitate
 (`coverage_shared`), states that the physics lacks (`coverage_hidden`), noise that breaks an assumption
-(`coverage_noise`), and terms that `select` chose (`coverage_choice`). A row is a system, its noise and what the learner
-sees; held, silent misses and the median width relative to the value. Allowed: silent misses of 5 %, with the standard
-error of so many draws.
+(`coverage_noise`), terms that `select` chose (`coverage_choice`), and records that mislead (`coverage_records`). A row
+is a system, its noise and what the learner sees; held, silent misses and the median width relative to the value.
+Allowed: silent misses of 5 %, with the standard error of so many draws.
 Run: python benchmarks/silent_misses.py [lagged draws, default 100] [draws of motions, default 30] [parts, default all];
 with few draws it tells of gross misses only. Parts run in as many processes as there are cores.
 """
@@ -24,6 +24,7 @@ import coverage_causes
 import coverage_choice
 import coverage_hidden
 import coverage_noise
+import coverage_records
 import coverage_shared
 import numpy as np
 from machine import describe
@@ -85,11 +86,17 @@ def _hidden(lagged: int, motions: int, words: str) -> Iterator[Row]:
         yield Row(one.system, one.noise, one.sees, one.draws, held, silent, width)
 
 
+def _records(_: int, motions: int) -> Iterator[Row]:
+    for one in coverage_records.rows(motions):
+        yield Row(one.system, one.noise, one.sees, one.draws, one.held, one.silent, one.width)
+
+
 PARTS: dict[str, Callable[[int, int], Iterator[Row]]] = {
     "causes": _causes,
     "motions with a hidden state": partial(_hidden, words="motion"),
     "choice": _choice,
     "noise of motions": _motion_noise,
+    "records": _records,
     "shared columns": _shared,
     "hidden states": partial(_hidden, words="lagged"),
     "noise": _noise,
