@@ -30,7 +30,6 @@ INPUTS = {  # and how many parameters are the fewest that such an input cannot t
     "a square wave": (np.sign(np.sin(2 * np.pi * 0.3 * T)), None),
     "a sweep": (np.sin(2 * np.pi * (0.2 * T + 0.05 * T**2)), None),
     "a drift": (T + 0.001 * NOISE, None),
-    "nothing": (np.ones(N), None),
 }
 
 
@@ -39,6 +38,16 @@ def test_an_input_of_few_frequencies_tests_few_parameters(u, fewest):
     record = oa.Record.from_arrays(u, NOISE, sampling_time=TS)
     named = [count for count in range(1, 12) if few_frequencies(record, count)]
     assert named == ([] if fewest is None else list(range(fewest, 12)))
+
+
+def test_inputs_that_do_not_move_are_named():
+    still = oa.Record.from_arrays(np.ones(N), NOISE, sampling_time=TS, inputs=["force"])
+    (warning,) = few_frequencies(still, 3)
+    assert warning.code == "constant_input" and "force does not move" in warning.text
+    levels = [np.ones(N), 2 * np.ones(N)]
+    several = oa.Record.join([oa.Record.from_arrays(u, NOISE, sampling_time=TS) for u in levels])
+    assert [one.code for one in few_frequencies(several, 3)] == ["constant_input"]
+    assert not few_frequencies(oa.Record.from_arrays(None, NOISE, sampling_time=TS), 3)
 
 
 def test_frequencies_of_several_inputs_and_experiments_count_together():
@@ -81,6 +90,6 @@ def rest(force: np.ndarray, noise: float) -> list[str]:
 
 
 def test_a_record_at_rest_explains_nothing_and_one_that_moves_is_not_called_that():
-    assert "explains_nothing" in rest(np.full(N, 5.0), 0.002)
+    assert {"explains_nothing", "constant_input"} <= set(rest(np.full(N, 5.0), 0.002))
     moved = 5 + np.repeat(np.random.default_rng(2).uniform(-1, 1, 30), 40)
     assert "explains_nothing" not in rest(moved, 0.002)

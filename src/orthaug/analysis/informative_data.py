@@ -30,13 +30,15 @@ _BY_CHANCE = 4.0
 
 
 def few_frequencies(record: Record, parameters: int) -> tuple[Warning, ...]:
-    """Return a warning where the inputs hold too few frequencies to test the physics.
+    """Return a warning where the inputs hold too few frequencies to test the physics, or none.
 
-    None where an input moves otherwise, such as by steps: its differences are looked at.
+    No warning where an input moves otherwise, such as by steps: its differences are looked at.
 
     Args:
         parameters: number of those that are estimated.
     """
+    if record.inputs and not any(np.ptp(e.inputs, axis=0).any() for e in record.experiments):
+        return (_no_movement(record),)
     lines: dict[str, list[float]] = {}
     most = (parameters + 1) // (2 * len(record.outputs))
     for j, channel in enumerate(record.inputs):
@@ -66,6 +68,18 @@ def few_frequencies(record: Record, parameters: int) -> tuple[Warning, ...]:
         "other amplitudes and more frequencies, or steps (`orthaug design` makes an input)."
     )
     return (Warning("few_frequencies", text),)
+
+
+def _no_movement(record: Record) -> Warning:
+    """Return the warning that no input moves."""
+    names = join_words([channel.name for channel in record.inputs])
+    verb = "does" if len(record.inputs) == 1 else "do"
+    text = (
+        f"{names} {verb} not move within an experiment: the data show how the outputs settle from "
+        "their start, and a static gain. Where they are at rest from the start, no other parameter "
+        "is determined. Give data in which the inputs move."
+    )
+    return Warning("constant_input", text)
 
 
 def _lines(signal: Vector, step: float, most: int) -> list[float] | None:
