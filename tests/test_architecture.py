@@ -67,6 +67,7 @@ CONCEPTS = {
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",
     "analysis.observer": "the verb `observe`",
+    "analysis.term_sensitivities": "slopes of a free run by terms that are added to it",
     "analysis.plant": "systems simulated for many inputs side by side",
     "analysis.signals": "excitation signals",
     "analysis.verdict_text": "verdicts on residuals, in words",

@@ -9,10 +9,11 @@ import pytest
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.missing_terms import doubted_equations, sensitivities
+from orthaug.analysis.missing_terms import doubted_equations
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
+from orthaug.analysis.term_sensitivities import sensitivities
 from orthaug.analysis.verdict_text import describe_colour, small_effects
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.conclusion import reopen_estimate

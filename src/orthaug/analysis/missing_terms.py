@@ -14,173 +14,21 @@ does not pass for colour.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
-from orthaug._base.jax import Array, padded_length, quick_jit
 from orthaug.analysis.suspects import changes_sign
-from orthaug.fitting.motion_estimate import MotionEstimate, fitted_numbers
+from orthaug.analysis.term_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.whiteness import whitening_filter
-from orthaug.models.dynamics import Numbers
-from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
-
-_ROWS = 20_000  # that are looked at, in segments spread over the record
-_NUMBERS = 8_000_000  # that are in memory at most
-
-Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
-"""Makes terms of states and inputs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
-    """Errors of m segments, and their slopes by starts, unknowns and added terms, in this order.
-
-    `columns` (m, T, ny, n0 + n + q), `errors` (m, T, ny), `scored` (m, T); q counts equations times
-    terms, those of the first equation in front. `points` (n, M) are the states and inputs that were
-    scored.
-    """
-
-    columns: Float[np.ndarray, "m T ny K"]
-    errors: Float[np.ndarray, "m T ny"]
-    scored: Bool[np.ndarray, "m T"]
-    points: Matrix
-    starts: int
-    nuisance: int
-    """n0, and n0 + n."""
-
-    def with_terms(self, kept: Bool[np.ndarray, "q"]) -> Sensitivities:
-        """Return the same with some of the added terms."""
-        every = np.concatenate([np.ones(self.nuisance, dtype=bool), kept])
-        return replace(self, columns=self.columns[..., every])
-
-
-@partial(quick_jit, static_argnames="form")
-def _slopes(
-    form: MotionDynamics,
-    numbers: Numbers,
-    states: Float[Array, "n0 m"],
-    inputs: Float[Array, "nu m"],
-) -> Any:
-    """Return ∂x⁺/∂(x, c, w), the outputs, and ∂y/∂(x, c, w) at every point."""
-    numbers = form.prepare(numbers)
-    return form.tangents(numbers, states, form.first_slopes(states.shape[1]), inputs)[1:]
-
-
-def sensitivities(
-    fit: MotionEstimate, equations: Sequence[int], terms: Callable[[Matrix], Terms], count: int
-) -> Sensitivities | None:
-    """Return the sensitivities along the training segments; None where a value is not finite.
-
-    Args:
-        equations: states whose equations the terms are added to.
-        terms: makes the terms, given the points (n, M) of the runs.
-        count: of terms.
-    """
-    segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
-    form = segmented.dynamics
-    # (k, m, T, n0)
-    runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)
-    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
-    k, m = runs.shape[:2]
-    x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
-    n0, n, q = form.states, form.unknowns, count * len(equations)
-    steps = min(x.shape[1], max(_NUMBERS // (target.shape[2] * (n0 + n + q)), 1))
-    there = np.flatnonzero(scored[:, :steps].any(axis=1))
-    most = max(min(_ROWS, _NUMBERS // (target.shape[2] * (n0 + n + q))) // steps, 1)
-    taken = there[np.unique(np.linspace(0, len(there) - 1, min(most, len(there))).astype(int))]
-    x, u, target, scored = (part[taken, :steps] for part in (x, u, target, scored))
-    at = x.shape[0] * x.shape[1]
-    read = form.at_samples(numbers, *(part.reshape(at, part.shape[2]) for part in (x, u)))
-    rows = np.concatenate([x, read.reshape(*x.shape[:2], read.shape[1])], axis=2)
-    points = rows[scored].T
-    if not np.isfinite(points).all():
-        return None
-    to_next, value, to_output = _at_rows(form, numbers, x, u)
-    with np.errstate(all="ignore"):
-        of_rows = terms(points)
-        added, at_ends = (
-            of_rows(one.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
-            for one in (rows, _ends(rows, n0, form.motion.hold))
-        )
-        columns = _propagate(to_next, to_output, added, at_ends, equations, form)
-    kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
-    if not kept[scored].all():
-        return None
-    return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
-
-
-def _ends(rows: Matrix, n0: int, hold: str) -> Matrix:
-    """Return states and inputs (m, T, n) at the end of every sample.
-
-    An input that is held keeps its value until there, and jumps then.
-    """
-    ends = np.concatenate([rows[:, 1:], rows[:, -1:]], axis=1)
-    if hold == "zero-order":
-        ends = np.concatenate([ends[..., :n0], rows[..., n0:]], axis=2)
-    return ends
-
-
-def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
-    """Return slopes (m, T, n0, n0 + n), outputs (m, T, ny) and their slopes at every row.
-
-    Slopes of outputs are (m, T, ny, n0 + n).
-    """
-    m, steps = x.shape[:2]
-    flat = [part.reshape(m * steps, -1).T for part in (x, u)]
-    length = padded_length(m * steps)
-    padded = [
-        np.concatenate([part, np.repeat(part[:, -1:], length - m * steps, axis=1)], axis=1)
-        for part in flat
-    ]
-    found = [
-        np.moveaxis(np.asarray(part)[..., : m * steps], -1, 0)
-        for part in _slopes(form, numbers, *padded)
-    ]
-    return tuple(part.reshape(m, steps, *part.shape[1:]) for part in found)  # type: ignore[return-value]
-
-
-def _propagate(
-    to_next: Any,
-    to_output: Any,
-    added: Any,
-    at_ends: Any,
-    equations: Sequence[int],
-    form: MotionDynamics,
-) -> Any:
-    """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next.
-
-    The terms act by the trapezoidal rule: `added` at the begin of a sample, `at_ends` at its end.
-    """
-    m, steps, n0, own = to_next.shape
-    q, h = len(added), form.sampling_time
-    columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
-    slope = np.zeros((m, n0, columns.shape[3]))
-    slope[:, :, :n0] = np.eye(n0)
-    for k in range(steps):
-        a, c = to_next[:, k, :, :n0], to_output[:, k, :, :n0]
-        columns[:, k] = c @ slope
-        columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
-        slope = a @ slope
-        slope[:, :, n0:own] += to_next[:, k, :, n0:]
-        now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
-        for place, i in enumerate(equations):
-            to = slice(own + place * q, own + (place + 1) * q)
-            if form.motion.scheme.discrete:
-                slope[:, i, to] += now
-                continue
-            slope[:, :, to] += h / 2 * a[:, :, i, None] * now[:, None]
-            slope[:, i, to] += h / 2 * then
-    return columns
-
 
 SHAPES = ("linear", "jump", "absolute", "square", "cube")
 _EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
@@ -277,6 +125,11 @@ class MissingTerm:
             if self.variable is None
             else words[SHAPES.index(self.shape)].format(self.variable)
         )
+
+    def curves_like(self, other: MissingTerm) -> bool:
+        """Return whether both count from a level of one variable: nearly straight there."""
+        same = (self.equation, self.variable) == (other.equation, other.variable)
+        return same and self.reference is not None and other.reference is not None
 
     def __str__(self) -> str:
         return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
@@ -411,20 +264,23 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     # Over a range that is small beside the level all shapes are nearly straight
     straight = (np.arange(len(gains)) % tried.count - 1) % len(SHAPES) == SHAPES.index("linear")
     gains = np.where(np.isfinite(references) & ~straight, _CURVED * gains, gains)
-    order = [int(j) for j in np.argsort(-gains) if gains[j] > _RIVAL * gains.max()]
-    listed = []
-    for j in order:
-        place, number = divmod(j, tried.count)
+    named: list[tuple[int, MissingTerm]] = []
+    for j in np.argsort(-gains):
+        if not gains[j] > _RIVAL * gains.max():
+            break
+        place, number = divmod(int(j), tried.count)
         equation = motion.names_of_states[equations[place]]
         made = (equation, number, float(coefficients[j]), float(shares[j]))
         term = _term(tried, sizes[0], *made)
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
-        listed.append(term)
-    for j, term in zip(order, listed, strict=True):
-        if term.shape in (BEYOND, "cube"):
-            best = _finer(fit, tried, equations[j // tried.count], term)
+        if not any(term.curves_like(other) for _, other in named):
+            named.append((place, term))
+    listed = [term for _, term in named]
+    for place, term in named:
+        if term.shape in (BEYOND, "cube") and term.reference is None:
+            best = _finer(fit, tried, equations[place], term)
             listed = listed if best is None else _with_finer(listed, best)
             break
     return MissingTest(p, freedom, share, tuple(listed))
@@ -585,8 +441,8 @@ def _joint_test(
     Args:
         constants: numbers of the constants beside which terms are tried, -1 for none.
     """
-    plain = _regression(found, None)
-    null = None if plain is None else _regression(found, _filters(found, plain.errors))
+    plain = _regression(found, None, constants)
+    null = None if plain is None else _regression(found, _filters(found, plain.errors), constants)
     if plain is None or null is None:
         return None
     basis = span(null.terms, _RANK)
@@ -598,7 +454,8 @@ def _joint_test(
     rest = max(total - explained, np.finfo(float).eps * total)
     p = float(scipy.special.fdtrc(rank, freedom, explained / rank / (rest / freedom)))
     basis = span(plain.terms, _RANK)
-    beside = _regression(found, _filters(found, plain.errors - basis @ (basis.T @ plain.errors)))
+    left = plain.errors - basis @ (basis.T @ plain.errors)
+    beside = _regression(found, _filters(found, left), constants)
     rows = null if beside is None else beside
     size = np.einsum("rj,rj->j", rows.terms, rows.terms)
     size = np.where(size > 0, size, np.inf)
@@ -655,9 +512,15 @@ def _shares(plain: _Regression) -> Vector:
 
 
 def _regression(
-    found: Sensitivities, filters: tuple[list[Vector], Vector] | None
+    found: Sensitivities,
+    filters: tuple[list[Vector], Vector] | None,
+    constants: Int[np.ndarray, "q"] | None = None,
 ) -> _Regression | None:
-    """Return filtered terms and errors, with starts and all unknowns projected out."""
+    """Return filtered terms and errors, with starts and all unknowns projected out.
+
+    A term of which hardly anything is left is none. Of those beside a constant (`constants`) what
+    the constant leaves counts.
+    """
     rows = [_filter_segment(found, i, filters) for i in range(len(found.scored))]
     parts, used = [], 0
     for block in rows:  # the starts move their own segment only
@@ -669,7 +532,12 @@ def _regression(
     unknowns = found.nuisance - found.starts
     q = span(whole[:, :unknowns])
     rest = whole[:, unknowns:]
-    before = np.linalg.norm(np.concatenate(rows)[:, found.nuisance : -1], axis=0)
+    columns = np.concatenate(rows)[:, found.nuisance : -1]
+    before = np.linalg.norm(columns, axis=0)
+    for j, constant in enumerate([] if constants is None else constants.tolist()):
+        if constant >= 0 and before[constant] > 0:
+            unit = columns[:, constant] / before[constant]
+            before[j] = np.linalg.norm(columns[:, j] - unit * (unit @ columns[:, j]))
     rest = rest - q @ (q.T @ rest)
     terms, errors = rest[:, :-1], rest[:, -1]
     terms = np.where(np.linalg.norm(terms, axis=0) > _OWN * before, terms, 0.0)
