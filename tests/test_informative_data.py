@@ -63,8 +63,8 @@ def test_frequencies_of_several_inputs_and_experiments_count_together():
     assert not few_frequencies(two, 2) and few_frequencies(two, 3)
 
 
-def rest(force: np.ndarray, noise: float) -> list[str]:
-    """Return the codes of the warnings on a mass and spring under a force."""
+def rest(force: np.ndarray, noise: float, sign: float = 1.0) -> dict[str, str]:
+    """Return the warnings on a mass and spring under a force, which is recorded with a sign."""
     m, c, k = 2.0, 3.0, 80.0
     x, v, y = force[0] / k, 0.0, []
     for f in force:
@@ -73,7 +73,11 @@ def rest(force: np.ndarray, noise: float) -> list[str]:
             v += TS / 20 * (f - c * v - k * x) / m
             x += TS / 20 * v
     record = oa.Record.from_arrays(
-        force, np.array(y) + noise * NOISE, sampling_time=TS, inputs=["force"], outputs=["place"]
+        sign * force,
+        np.array(y) + noise * NOISE,
+        sampling_time=TS,
+        inputs=["force"],
+        outputs=["place"],
     )
     motion = oa.Motion.from_equations(
         states=[oa.State("x", "v", start="place"), oa.State("v", "(force - c*v - k*x)/m")],
@@ -86,10 +90,11 @@ def rest(force: np.ndarray, noise: float) -> list[str]:
         ],
     )
     fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation())
-    return [one.code for one in fit.diagnose().warnings]
+    return {one.code: one.text for one in fit.diagnose().warnings}
 
 
 def test_a_record_at_rest_explains_nothing_and_one_that_moves_is_not_called_that():
     assert {"explains_nothing", "constant_input"} <= set(rest(np.full(N, 5.0), 0.002))
     moved = 5 + np.repeat(np.random.default_rng(2).uniform(-1, 1, 30), 40)
     assert "explains_nothing" not in rest(moved, 0.002)
+    assert "sign and the unit of every input" in rest(moved - 5, 0.0005, -1.0)["explains_nothing"]

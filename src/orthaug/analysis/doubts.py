@@ -280,7 +280,8 @@ def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
     moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
     if len(best.moves) != len(names):
         return {}
-    values = fit.problem.values_at(moved)
+    with np.errstate(over="ignore"):  # one linear step may go far; what is not finite is left out
+        values = fit.problem.values_at(moved)
     return {
         name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
     }

@@ -92,14 +92,16 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
         ran = {part.name: score_part(physics.model, part, []) for part in evidence.parts}
         alone = {name: scored for name, (scored, _) in ran.items()}
     one_step = isinstance(evidence.criterion, Prediction) or fit.model.coloured
-    if fit.status.ok and not one_step:
-        run, estimated = responses[evidence.train.name][1], len(fit.problem.names)
-        warnings += explains_nothing(run, evidence.train, estimated)
     if fit.status.ok and one_step and fit.learns:
         chosen_by = [p.name for p in evidence.parts if not p.name.startswith("tests.")]
         warnings += _one_step_only(scores, alone, chosen_by)
     Stage.INTERVALS.enter()
     fit, fields = _analyse(fit, evidence, responses, warnings)
+    if fit.status.ok and not one_step:
+        run, estimated = responses[evidence.train.name][1], len(fit.problem.names)
+        residuals = fields["residuals"]
+        driven = residuals is not None and residuals.verdict == "unmodelled"
+        warnings += explains_nothing(run, evidence.train, estimated, driven=driven)
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
     content = fields | {

@@ -101,13 +101,16 @@ def _lines(signal: Vector, step: float, most: int) -> list[float] | None:
     return None
 
 
-def explains_nothing(free_run: Response, part: Part, parameters: int) -> tuple[Warning, ...]:
+def explains_nothing(
+    free_run: Response, part: Part, parameters: int, *, driven: bool
+) -> tuple[Warning, ...]:
     """Return a warning where a free run explains no more of an output than of noise.
 
     Args:
         free_run: over the training data, on which it was trained.
         part: the training data.
         parameters: number of those that are estimated.
+        driven: whether the error is more than noise: then the outputs move, but otherwise.
     """
     if any(run.diverged for run in free_run.trajectories):
         return ()
@@ -123,9 +126,15 @@ def explains_nothing(free_run: Response, part: Part, parameters: int) -> tuple[W
     ]
     if not none:
         return ()
+    meant = (
+        "The outputs do move, but not as the physics says. Check the sign and the unit of every "
+        "input, the initial values and the bounds."
+        if driven
+        else "The parameters are those of the noise, but for what the mean determines, and their "
+        "intervals mean nothing. Give data in which the inputs move the outputs."
+    )
     text = (
         f"the free run explains no more of {join_words(none)} than it would of noise by chance. "
-        "The parameters are those of the noise, but for what the mean determines, and their "
-        "intervals mean nothing. Give data in which the inputs move the outputs."
+        f"{meant}"
     )
     return (Warning("explains_nothing", text),)

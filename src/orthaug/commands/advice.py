@@ -257,6 +257,8 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
         yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
 
 
+# Errors over the output's deviation: of a run that says nothing, and of one that leaves the output
+_NO_BETTER, _RUNS_AWAY = (0.95, 3.0)
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
@@ -414,8 +416,13 @@ def _conclude_trials(
     base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     before = math.sqrt(mean_square(base))
+    poor = before < _RUNS_AWAY  # then what stays no better than the mean is no remedy
     helps = [
-        one for one in tried if one.pieces is not None and _ratio(one.pieces, base).code == "helps"
+        one
+        for one in tried
+        if one.pieces is not None
+        and _ratio(one.pieces, base).code == "helps"
+        and not (poor and one.error > _NO_BETTER)
     ]
     better: list[ProposalErrors] = []
     for one in sorted(helps, key=lambda one: one.error):
