@@ -186,7 +186,9 @@ def _of_motion(
     text = free_run_words(
         verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse
     )
-    warnings = [one.warning for one in late] + ([coarse.warning] if coarse else [])
+    warnings = [one.warning for one in late] + (
+        [coarse.warning] if coarse and coarse.warning else []
+    )
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)

@@ -26,7 +26,12 @@ E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
-_NOISE_ONLY = ("unexplained", "parameter_drift")  # warnings that leave intervals of noise alone
+# Warnings that leave intervals of noise alone
+_NOISE_ONLY = ("unexplained", "parameter_drift", "quantised_output", "explains_nothing") + (
+    "few_frequencies",
+    "little_left",
+    "output_without_learner",
+)
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
 _MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judged beside it

@@ -33,7 +33,7 @@ _WAYS: Mapping[str, tuple[str, Callable[[AnyArray], AnyArray]]] = {
 }
 _REPEATS = 4
 _MOST = 0.5  # of the error's mean square: less is not mainly the steps
-_MATTERS = 0.25  # standard errors: by less a parameter is not said to be moved
+_MATTERS = 0.25  # standard errors: by less no parameter is said to be moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class QuantisedOutput:
 
     `steps` by output, in its unit; `share` of the error's mean square that they explain; `left`
     what of the error (N, ny) of each experiment they do not; `moved` (np,) by how much they move
-    p̂; `whole` where they leave too little to test.
+    p̂; `whole` where they leave too little to test. No warning where they move no parameter.
     """
 
     steps: Mapping[str, float]
@@ -50,7 +50,7 @@ class QuantisedOutput:
     share: float
     left: list[Matrix]
     moved: Vector
-    warning: Warning
+    warning: Warning | None
     whole: bool = False
 
 
@@ -133,8 +133,8 @@ def _explain_by(
 
 def _warning(
     fit: MotionEstimate, steps: Mapping[str, float], way: str, share: float, shift: Vector
-) -> Warning:
-    """Return the warning with the parameters that the steps move."""
+) -> Warning | None:
+    """Return the warning with the parameters that the steps move; None where they move none."""
     units = {c.name: f" {c.unit}".rstrip() for c in fit.problem.record.outputs}
     recorded = [f"{name} in steps of {step:.3g}{units[name]}" for name, step in steps.items()]
     moved = []
@@ -145,14 +145,12 @@ def _warning(
         if errors > _MATTERS:
             own = f", {percent(by / value, sign='+')}" if value else ""
             moved.append(f"{name} by {by:+.2g} ({errors:.1f} standard errors{own})")
-    effect = (
-        f"It moves {join_words(moved)}: subtract that; the intervals do not count it."
-        if moved
-        else "It moves no parameter by more than a quarter of a standard error."
-    )
+    if not moved:
+        return None
     text = (
         f"the record has {join_words(recorded)}, {_WAYS[way][0]}. That explains {percent(share)} "
         "of the mean square of the free run's error, and is a function of the signal rather than "
-        f"noise. {effect} Remedies: a finer measurement, or inputs that sweep each step faster."
+        f"noise. It moves {join_words(moved)}: subtract that; the intervals do not count it. "
+        "Remedies: a finer measurement, or inputs that sweep each step faster."
     )
     return Warning("quantised_output", text)
