@@ -26,12 +26,11 @@ E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
-# Warnings that leave intervals of noise alone
-_NOISE_ONLY = ("unexplained", "parameter_drift", "quantised_output", "explains_nothing") + (
-    "few_frequencies",
-    "little_left",
-    "output_without_learner",
+NOISE_ONLY = (
+    *("unexplained", "parameter_drift", "quantised_output", "explains_nothing"),
+    *("few_frequencies", "little_left", "output_without_learner"),
 )
+"""Codes of warnings that leave intervals of noise alone."""
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
 _MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judged beside it
@@ -84,7 +83,7 @@ def doubt(made: E) -> E:
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test, hidden=hidden)
-    if any(warning.code in _NOISE_ONLY for warning in found["warnings"]):
+    if any(warning.code in NOISE_ONLY for warning in found["warnings"]):
         found |= {
             name: _noise_only(getattr(result, name), withdrawn=left > _LEFT)
             for name in ("parameters", "physical_parameters")

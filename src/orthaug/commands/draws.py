@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, check_choice, check_count, check_number
 from orthaug._base.errors import InputError, TrainingError
-from orthaug.analysis.doubts import doubt
+from orthaug.analysis.doubts import NOISE_ONLY, doubt
 from orthaug.analysis.examination import with_verdict
 from orthaug.commands.advice import apply_change
 from orthaug.commands.design import design_for
@@ -34,7 +34,7 @@ _WIDEST = 3.0  # of the recorded range of an output: what leaves that is another
 _HALVINGS = 8  # of a term that makes the run leave all bounds
 _ONE_START = {"training.restarts": 1}  # of other choices, which are many
 # Of these a text does not name all parameters that it doubts
-_DOUBTS = frozenset({"unexplained", "hidden_state", "inconsistent", "sensor_noise"})
+_DOUBTS = frozenset({*NOISE_ONLY, "hidden_state", "inconsistent", "sensor_noise"})
 _ANSWERED = frozenset({"biased"})  # with an interval of its own, which then has to hold the truth
 
 
