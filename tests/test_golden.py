@@ -33,7 +33,7 @@ VOLATILE = {
         "seconds",
         "sha256",
         "spec",
-    ),  # versions, times, checksums, the spec as it is given
+    ),  # versions, times, checksums of files and of a model, the spec as it is given
     *("text", "message", "sentence", "doubt"),  # words for people, which may change
     *(
         "worst",
@@ -41,9 +41,7 @@ VOLATILE = {
         "weights_worst",
     ),  # where something is largest, often at several places alike
 }
-ROUNDING = (
-    1e-12  # of a response: its input does not reach the output, and its phase is that of rounding
-)
+ROUNDING = 1e-12  # a response whose input does not reach the output, so that its phase is rounding
 LONG = 24  # numbers of a list from which on only a few, mean and RMS are kept
 
 
@@ -100,7 +98,11 @@ def lasting(value: Any) -> Any:
     if isinstance(sizes, list) and np.max(np.abs(sizes), initial=0.0) < ROUNDING:
         return "rounding"
     if isinstance(value, dict):
-        return {name: lasting(entry) for name, entry in value.items() if name not in VOLATILE}
+        return {
+            name: lasting(entry)
+            for name, entry in value.items()
+            if name not in VOLATILE and not (name == "model" and isinstance(entry, str))
+        }  # the checksum of a model is that of its last bits
     if (
         isinstance(value, list)
         and len(value) > LONG
