@@ -503,6 +503,16 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
         "its error is no larger than the steps in which x is recorded" in coarse.trust
         and "the steps of x are as large as the error" in coarse.then
     )
+    white = residuals.model_copy(update={"verdict": "white", "steps": None})
+    for code, words in (
+        ("little_left", "rests on little of its regressor"),
+        ("output_without_learner", "an output has parameters of a learned equation"),
+        ("few_frequencies", "too few frequencies"),
+    ):
+        seen = changed | {"residuals": white, "warnings": [Warning(code, "…")]}
+        untested = fit_verdict(motion.result.model_copy(update=seen))
+        assert untested.level == "care" and words in untested.trust
+        assert "Do not read" in untested.use and "the warning names" in untested.use
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
     far = test.simulation.model_copy(
         update={"rmse": [2 * value for value in train.simulation.rmse]}

@@ -136,10 +136,7 @@ def _parameters(result: FitResult) -> list[Any]:
     if result.intervals is not None and result.intervals.source != "none":
         caption += f" {result.intervals.text[0].upper()}{result.intervals.text[1:]}"
     if result.noise_only:
-        caption += (
-            " Intervals count noise only: the model's error contains more than noise, which "
-            "may have moved the parameters."
-        )
+        caption += " Intervals count noise only: the warnings say what else may have moved them."
     if result.standard_errors is not None:
         caption += (
             " Intervals hold for the inputs that were applied; under other inputs the bias differs."

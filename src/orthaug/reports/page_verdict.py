@@ -290,6 +290,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    yield from (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     if _has_warning(result, "closed_loop"):
         yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
@@ -332,10 +333,21 @@ def _is_biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
+_UNTESTED = {
+    "explains_nothing": "its free run explains nothing of an output",
+    "quantised_output": "the steps of an output move its parameters",
+    "little_left": "a parameter rests on little of its regressor beside the learner",
+    "output_without_learner": "an output has parameters of a learned equation, but no learner",
+    "few_frequencies": "its input has too few frequencies to test the physics",
+}
+"""Doubts by warnings that no test of the residual sees."""
+
+
 def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
     sure = [row.name for row in rows if _is_known(row)]
-    known = sure if _noise_alone(result) else []
+    untested = any(_has_warning(result, code) for code in _UNTESTED)
+    known = sure if _noise_alone(result) and not untested else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
     ahead, part = _worst_score(result.scores, "prediction")
@@ -356,8 +368,8 @@ def _use_text(result: FitResult, level: str) -> str:
     if sure and not known:
         cover = "interval does" if len(sure) == 1 else "intervals do"
         text += (
-            f". Do not read {join_words(sure)} as physics yet: the {cover} not include what the "
-            "residual still contains"
+            f". Do not read {join_words(sure)} as physics yet: the {cover} not include what "
+            f"{'the residual still contains' if not _noise_alone(result) else 'the warning names'}"
         )
     text += (
         f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
