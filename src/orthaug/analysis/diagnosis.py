@@ -29,7 +29,7 @@ from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longes
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.output_response import from_fitted_start
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
-from orthaug.analysis.quantised_output import quantised_output
+from orthaug.analysis.quantised_output import coarse_steps, quantised_output
 from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
 from orthaug.analysis.verdict_text import (
     SHARE,
@@ -39,7 +39,6 @@ from orthaug.analysis.verdict_text import (
     free_run_words,
     words,
 )
-from orthaug.data.columns import quantum_of
 from orthaug.data.record import Experiment
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Simulation
@@ -372,12 +371,8 @@ def _inconsistent(
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
     """Return the steps of outputs that are recorded in steps as large as the one-step error."""
-    found = {}
-    for i, test in enumerate(tests):
-        step = quantum_of(np.concatenate([e.outputs[:, i] for e in problem.record.experiments]))
-        if step is not None and (test.rms or np.inf) <= step:
-            found[test.name] = step
-    return found
+    steps = coarse_steps(problem.record, np.array([test.rms or np.nan for test in tests]))
+    return {test.name: float(step) for test, step in zip(tests, steps, strict=True) if step}
 
 
 def _is_small(seen: Finding) -> bool:

@@ -21,6 +21,7 @@ from orthaug._base.lines import join_words, percent
 from orthaug.analysis.motion_response import coordinates_moved, parameters_moved
 from orthaug.analysis.residuals import errors_of, rms_errors
 from orthaug.data.columns import quantum_of
+from orthaug.data.record import Record
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segments import respond
 from orthaug.models.response import Response
@@ -54,6 +55,18 @@ class QuantisedOutput:
     whole: bool = False
 
 
+def coarse_steps(record: Record, rms: Vector) -> Vector:
+    """Return the steps (ny,) of outputs that are recorded in steps as large as their RMS error.
+
+    0 for the others, and where there is no error.
+    """
+    found = np.zeros(len(record.outputs))
+    for i, error in enumerate(rms):
+        step = quantum_of(np.concatenate([e.outputs[:, i] for e in record.experiments]))
+        found[i] = step if step is not None and 0 < error <= step else 0.0
+    return found
+
+
 def quantised_output(fit: MotionEstimate, free_run: Response) -> QuantisedOutput | None:
     """Return what coarse steps of the outputs do to a motion's fit.
 
@@ -65,18 +78,14 @@ def quantised_output(fit: MotionEstimate, free_run: Response) -> QuantisedOutput
     """
     if fit.model.coloured or fit.scores is None or fit.split_by.slope is None:
         return None
-    record, size = fit.problem.record, rms_errors(free_run)
-    quanta = np.zeros(len(record.outputs))
-    for i in range(len(quanta)):
-        step = quantum_of(np.concatenate([e.outputs[:, i] for e in record.experiments]))
-        quanta[i] = step if step is not None and 0 < size[i] <= step else 0.0
+    record = fit.problem.record
+    quanta, first = coarse_steps(record, rms_errors(free_run)), record.experiments[0].outputs[0]
     if not quanta.any():
         return None
-    firsts = np.array([e.outputs[0] for e in record.experiments])[0]
     found = [
         tried
         for way in _WAYS
-        if (tried := _explain_by(way, fit, free_run, quanta, firsts)) is not None
+        if (tried := _explain_by(way, fit, free_run, quanta, first)) is not None
     ]
     best = max(found, key=lambda tried: tried.share, default=None)
     return best if best is not None and best.share > _MOST else None
@@ -113,10 +122,9 @@ def _explain_by(
                     segmented.dynamics, segmented.numbers(*here), segmented.segments, fit.states
                 )
             )
-            moved = coordinates_moved(fit, at_fit + error(y, -2))
-            if moved is None or not np.isfinite(moved).all():
+            step = coordinates_moved(fit, at_fit + error(y, -2))
+            if step is None or not np.isfinite(step).all():
                 return None
-            step = moved
         here = np.clip(c - step[: len(c)], low, high), w - step[len(c) :]
         run = replace(fit.model, numbers=segmented.numbers(*here)).simulate(fit.problem.record)
         left = [trajectory.errors - error(trajectory.model, -1) for trajectory in run.trajectories]
