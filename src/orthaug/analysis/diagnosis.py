@@ -30,7 +30,15 @@ from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.output_response import from_fitted_start
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
 from orthaug.analysis.quantised_output import coarse_steps, quantised_output
-from orthaug.analysis.residuals import LAGS, ROUNDING, ResidualTest, analyse, errors_of, rms_errors
+from orthaug.analysis.residuals import (
+    LAGS,
+    ROUNDING,
+    ResidualTest,
+    analyse,
+    errors_of,
+    measured_of,
+    rms_errors,
+)
 from orthaug.analysis.verdict_text import (
     SHARE,
     Diagnosis,
@@ -72,6 +80,7 @@ _NAMED = 3
 _LEVEL = 0.01  # of the test of missing terms
 # Of the output's deviation: a free run that leaves less has no dead time to look for
 _SIZABLE = 0.02
+_FEWEST_COMPLETE = 30  # rows with all outputs, to test residuals
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
 _BY_START = 0.5  # of the error's squares: less is left where noise in the measured start made most
@@ -156,6 +165,14 @@ def _of_motion(
     states = [own[first:] for own, first in zip(_states(fit), firsts, strict=True)]
     if not np.isfinite(np.concatenate(states)).all():
         return None
+    if not record.complete:  # tests of several outputs need them on the same rows
+        there = [~np.isnan(own).any(axis=1) for own in measured_of(free_run)]
+        errors, inputs, states = (
+            [own[rows] for own, rows in zip(parts, there, strict=True)]
+            for parts in (errors, inputs, states)
+        )
+        if sum(map(len, errors)) < _FEWEST_COMPLETE:
+            return None
     names = ([c.name for c in record.outputs], list(motion.external), list(motion.names_of_states))
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
@@ -538,8 +555,12 @@ def find_drift(response: Response, kind: str) -> tuple[Warning, ...]:
     found = []
     for j, output in enumerate(response.outputs):
         squares, lines, ends = 0.0, 0.0, (0.0, 0.0)
-        for error in (piece[:, j] for piece in errors_of(response) if len(piece) > _LINE):
-            time = np.linspace(-1.0, 1.0, len(error))
+        for piece in (piece[:, j] for piece in errors_of(response) if len(piece) > _LINE):
+            there = ~np.isnan(piece)
+            if there.sum() <= _LINE:
+                continue
+            time, error = np.linspace(-1.0, 1.0, len(piece))[there], piece[there]
+            time = time if there.all() else time - time.mean()
             slope = float(time @ error / (time @ time))
             squares += float(np.sum((error - error.mean()) ** 2))
             lines += slope**2 * float(time @ time)
@@ -571,6 +592,7 @@ def wild_rows(
     distance, few = (_WILD_IN_RUN, _FEW_IN_RUN) if free_run else (_WILD, _FEW)
     for j, output in enumerate(response.outputs):
         error = np.concatenate(errors)[:, j]
+        error = np.where(np.isnan(error), np.nanmedian(error), error)
         size = np.abs(error - np.median(error))
         wild = np.flatnonzero(size > distance * _MAD * np.median(size))
         held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)

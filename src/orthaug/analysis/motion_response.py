@@ -31,7 +31,7 @@ from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.initial_states import InitialStates
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.segmented_motion import SegmentedMotion
-from orthaug.fitting.segments import Segments, respond, sensitivity, sensitivity_once
+from orthaug.fitting.segments import Segments, packed, respond, sensitivity, sensitivity_once
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
@@ -129,7 +129,8 @@ class TermsResponse:
     def size(self, k: int) -> float:
         """Return the RMS effect of a unit of the term on the outputs, in their deviations."""
         segmented, weight = self.place.segmented, self.place.weight
-        whole = segmented.segments.count * float(np.sum((weight * segmented.deviation) ** 2))
+        counts = segmented.observations
+        whole = float(np.sum(counts * (weight * segmented.deviation) ** 2))
         return float(
             np.sqrt(max(self.information[self.parameters + k, self.parameters + k], 0.0) / whole)
         )
@@ -157,8 +158,9 @@ class TermsResponse:
         errors = place.segmented.objective().errors(
             place.c, place.w, place.states, place.segmented.segments
         )
-        errors = np.einsum("oi,ktim->ktom", place.weight, errors)
-        scored = np.asarray(place.segmented.segments.scored)[:, :, None]
+        segments = place.segmented.segments
+        errors = np.einsum("oi,ktim->ktom", place.weight, packed(errors, segments))
+        scored = packed(segments.measured, segments)
         pairs = scored[:, 1:] & scored[:, :-1]
         apart = float(np.sum(np.where(pairs, np.diff(errors, axis=1), 0.0) ** 2)) / 2
         whole = float(np.sum(errors**2))

@@ -79,6 +79,8 @@ def quantised_output(fit: MotionEstimate, free_run: Response) -> QuantisedOutput
     if fit.model.coloured or fit.scores is None or fit.split_by.slope is None:
         return None
     record = fit.problem.record
+    if not record.complete:
+        return None
     quanta, first = coarse_steps(record, rms_errors(free_run)), record.experiments[0].outputs[0]
     if not quanta.any():
         return None

@@ -214,9 +214,20 @@ def errors_of(response: Response, skip: int = 0) -> list[Matrix]:
 
 
 def rms_errors(response: Response, skip: int = 0) -> Vector:
-    """Return the RMS error of every output."""
+    """Return the RMS error of every output, over the rows where it was measured."""
+    errors = np.concatenate(errors_of(response, skip))
     with np.errstate(all="ignore"):
-        return np.sqrt(np.mean(np.concatenate(errors_of(response, skip)) ** 2, axis=0))
+        there = ~np.isnan(np.concatenate(measured_of(response, skip)))
+        return np.sqrt(np.mean(errors**2, axis=0, where=there))
+
+
+def measured_of(response: Response, skip: int = 0) -> list[Matrix]:
+    """Return the measured outputs of each experiment on the rows of `errors_of`."""
+    found = []
+    for one in response.trajectories:
+        assert one.measured is not None, "of a record with measured outputs"
+        found.append(one.measured[one.start :][skip:])
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,8 @@ def sensitivities(
     form = segmented.dynamics
     # (k, m, T, n0)
     runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)
-    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in segmented.segments[1:]]
+    measured = segmented.segments._replace(scored=segmented.segments.complete)
+    segments = [np.moveaxis(np.asarray(part), -1, 1) for part in measured[1:]]
     k, m = runs.shape[:2]
     x, u, target, scored = (part.reshape(k * m, *part.shape[2:]) for part in (runs, *segments))
     n0, n, q = form.states, form.unknowns, count * len(equations)

@@ -79,7 +79,7 @@ class Data(Section):
     experiment: Annotated[str, Field(min_length=1)] | None = None
     inputs: list[str] = []
     outputs: Annotated[list[str], Field(min_length=1)]
-    missing: Literal["error", "skip"] = "error"
+    missing: Literal["error", "skip", "keep"] = "error"
     train: PartSection
     validation: PartSection | None = None
     tests: dict[str, PartSection] = {}

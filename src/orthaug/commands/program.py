@@ -163,7 +163,8 @@ Initial = Annotated[
 Missing = Annotated[
     str,
     typer.Option(
-        "--missing", metavar="error|skip", help="Rows with missing cells; skip leaves them out."
+        "--missing", metavar="error|skip|keep",
+        help="Rows with missing cells: skip leaves them out, keep simulates a motion through them."
     ),
 ]
 Rows = Annotated[

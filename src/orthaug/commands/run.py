@@ -56,7 +56,7 @@ class ReadOptions:
         Raises:
             InputError: an invalid value of an option.
         """
-        check_choice(missing, ("error", "skip"), "--missing")
+        check_choice(missing, ("error", "skip", "keep"), "--missing")
         if every < 1:
             raise InputError(f"--every: found {every}; expected 1 or more.")
         named = {}

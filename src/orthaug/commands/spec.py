@@ -376,6 +376,7 @@ class Spec(Section):
                 'one with `integrator` = "discrete", or leave it out and estimate one step '
                 'ahead with `noise.model` = "arma"'
             )
+        self._check_gaps()
         wrong = self.declared_physics.foreign_keys
         for i, section in enumerate(self.suspects):
             for key in sorted(section.model_fields_set & wrong.keys()):
@@ -386,6 +387,21 @@ class Spec(Section):
                 "equations"
             )
         return self
+
+    def _check_gaps(self) -> None:
+        """Raise ValueError where outputs may not be missing."""
+        if self.data.missing != "keep":
+            return
+        found = '`data.missing`: found "keep"'
+        if self.motion is None:
+            raise ValueError(
+                f"{found}; lagged physics needs the outputs of every row. Leave rows out by "
+                '"skip", or state the physics as a [motion]'
+            )
+        if self.noise.model != "white":
+            raise ValueError(f'{found}; a predictor of `noise.model` needs every row: "white"')
+        if self.engine.kind not in ("auto", "memory"):
+            raise ValueError(f'{found}; rows must be in memory for it: `engine.kind` = "memory"')
 
     @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:

@@ -43,6 +43,22 @@ def unbroken(values: Matrix) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
+def without_gaps(outputs: Matrix) -> Matrix:
+    """Return outputs whose missing samples are interpolated linearly between the measured ones.
+
+    Zero where there are none.
+    """
+    filled = outputs.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        column[~there] = (
+            np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+            if there.any()
+            else 0.0
+        )
+    return filled
+
+
 def instants_of(count: int, sampling_time: float, steps: Vector | None) -> Vector:
     """Return the instants (count,) of rows in s, the first of them 0.
 
@@ -455,18 +471,29 @@ class Record(NotebookView):
         """Outputs first, then inputs: the order of the regressor."""
         return self.outputs + self.inputs
 
+    @property
+    def complete(self) -> bool:
+        """True if every output was measured on every row."""
+        return not any(np.isnan(experiment.outputs).any() for experiment in self.experiments)
+
+    @property
+    def measured(self) -> tuple[Vector, ...]:
+        """The samples of each output that were measured, experiments one after another."""
+        columns = np.concatenate([experiment.outputs for experiment in self.experiments]).T
+        return tuple(column[~np.isnan(column)] for column in columns)
+
     def check_measured(self) -> None:
         """Raise InputError where an output is missing.
 
-        A record for an `Observer` may miss outputs.
+        A record for an `Observer` or a motion may miss outputs.
         """
         for experiment in self.experiments:
             bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
             if bad.size:
                 raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing, which only an "
-                    "Observer accepts; leave "
-                    'such rows out (`missing = "skip"`), or split the experiment there.'
+                    f"{experiment.where(int(bad[0]))}: an output is missing, which lagged physics "
+                    "needs on every row; leave "
+                    'such rows out (`missing = "skip"`), or state the physics as a [motion].'
                 )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:

@@ -30,7 +30,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.record import Record
 from orthaug.fitting.colour import autoregression, correlation_length
 from orthaug.fitting.objective import errors_of
-from orthaug.fitting.segments import Segments, begins_of, block_scores, respond
+from orthaug.fitting.segments import Segments, begins_of, block_scores, packed, respond
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.statistics import Statistics
 
@@ -68,8 +68,12 @@ class FreeRunScores:
         return int(np.asarray(self.segments.scored).sum(axis=1).max())
 
     def errors(self) -> Float[np.ndarray, "ny s T"]:
-        """Return the errors of each output by segments, 0 where a step is not scored."""
+        """Return the errors of each output by segments, those that are scored and measured first.
+
+        Then zeros; in their places where nothing is missing.
+        """
         errors = errors_of(self.dynamics, self.numbers, self.states, self.segments)
+        errors = packed(errors, self.segments)
         return np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3]).transpose(2, 0, 1)
 
     def block(self) -> int | None:
@@ -131,14 +135,14 @@ class FreeRunScores:
         return self.share * self.unit * found
 
     def slopes(self) -> Float[np.ndarray, "N ny n"]:
-        """Return the sensitivities of p on every scored step, the starts eliminated.
+        """Return the sensitivities of p on every complete step, the starts eliminated.
 
         In the units of the model's Gram matrix.
 
         They are the scores of errors of 1 in one whitened output after the other.
         """
         model = np.asarray(respond(self.dynamics, self.numbers, self.segments, self.states))
-        scored, n0 = np.asarray(self.segments.scored), self.segments.start.shape[1]
+        there, n0 = np.moveaxis(self.segments.complete, -1, 1), self.segments.start.shape[1]
         place = np.arange(self.segments.steps, dtype=np.int32)
         found = []
         for unit in np.linalg.inv(self.weight).T:
@@ -158,7 +162,7 @@ class FreeRunScores:
                 if self.slope is None
                 else sums[..., n0:] - sums[..., :n0] @ self.slope
             )
-            found.append(own[np.moveaxis(scored, -1, 1)])
+            found.append(own[there])
         return np.sqrt(self.unit) * np.stack(found, axis=1)
 
     def whitened(self) -> Float[np.ndarray, "N ny"]:
@@ -166,7 +170,7 @@ class FreeRunScores:
         errors = np.moveaxis(
             errors_of(self.dynamics, self.numbers, self.states, self.segments), 3, 1
         )  # (k, m, T, ny)
-        there = errors[np.moveaxis(np.asarray(self.segments.scored), -1, 1)]
+        there = errors[np.moveaxis(self.segments.complete, -1, 1)]
         return np.sqrt(self.unit) * there @ self.weight.T
 
     def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
@@ -176,7 +180,7 @@ class FreeRunScores:
             used: parameters of the fit, by which its errors are too small.
         """
         scores = self.blocks(steps)
-        blocks, rows = len(scores), self.share * self.segments.count * len(self.weight)
+        blocks, rows = len(scores), self.share * float(self.segments.observations.sum())
         correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
         return self.share * correction * self.unit**2 * scores.T @ scores, blocks
 
@@ -190,10 +194,11 @@ class FreeRunScores:
         Args:
             used: parameters of the fit, by which its errors are too small.
         """
-        lengths = np.asarray(self.segments.scored).sum(axis=1).ravel()
+        lengths = self.segments.complete.sum(axis=1).ravel()
         ends = np.cumsum(lengths)[:-1]
         slopes, errors = np.split(self.slopes(), ends), np.split(self.whitened(), ends)
         outputs, rows = errors[0].shape[1], self.share * sum(lengths)
+        share = self.share * self.segments.observations.sum() / max(outputs * sum(lengths), 1)
         total, independent = 0.0, np.inf
         for o in range(outputs):
             colour = autoregression([piece[:, o] for piece in errors if len(piece)])
@@ -211,7 +216,7 @@ class FreeRunScores:
             * independent
             / max(independent - 1.0, 1.0)
         )
-        return self.share * correction * np.asarray(total), independent
+        return share * correction * np.asarray(total), independent
 
     def robust(
         self,

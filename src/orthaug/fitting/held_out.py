@@ -55,7 +55,9 @@ class Ratio:
             certain = math.inf if lost > other_lost else 0.0
             return cls(certain, certain, certain)
         both = [
-            (a, b) for a, b in zip(model, other, strict=True) if a is not None and b is not None
+            (a, b)
+            for a, b in zip(model, other, strict=True)
+            if a is not None and b is not None and len(a)
         ]
         if not both:
             return cls(math.nan, math.nan, math.nan)
@@ -177,7 +179,8 @@ def squared_errors(
 ) -> list[Vector | None]:
     """Return the squared errors of a response along each experiment.
 
-    Each output counts in its `unit`; the mean is over the outputs.
+    Each output counts in its `unit`; the mean is over the outputs that were measured. Rows without
+    any are left out.
 
     Args:
         skip: leading samples of each experiment that do not count, as in `Response.scores`.
@@ -187,9 +190,12 @@ def squared_errors(
     for trajectory, first in zip(response.trajectories, skips, strict=True):
         assert trajectory.measured is not None, "errors need measured outputs"
         rows = slice(max(trajectory.start, first), None)
+        measured = trajectory.measured[rows]
+        there = ~np.isnan(measured)
+        some = there.any(axis=1)
         with np.errstate(all="ignore"):
             squares = np.mean(
-                ((trajectory.measured[rows] - trajectory.model[rows]) / unit) ** 2, axis=1
+                ((measured - trajectory.model[rows])[some] / unit) ** 2, axis=1, where=there[some]
             )
         pieces.append(
             squares if trajectory.diverged is None and np.isfinite(squares).all() else None

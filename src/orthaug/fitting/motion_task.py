@@ -282,7 +282,7 @@ def substep_shift(
                 respond(one.dynamics, one.numbers(point.c, point.w), one.segments, point.states)
             )
         )
-    scored = np.asarray(segmented.segments.scored)[:, :, None]
+    scored = segmented.segments.measured
     with np.errstate(all="ignore"):
         moved = np.where(scored, runs[1] - runs[0], 0.0) / segmented.deviation[:, None]
         ratio = np.sqrt(np.sum(moved**2) / max(_squares_at_end(segmented, free_fit), 1e-300))

@@ -17,7 +17,7 @@ from orthaug._base.jax import AnyArray
 from orthaug.fitting.colour import independent_share, share_of, spectrum_size
 from orthaug.fitting.initial_states import InitialStates, Start
 from orthaug.fitting.segment_sums import SegmentSums
-from orthaug.fitting.segments import Segments, respond, sensitivity
+from orthaug.fitting.segments import Segments, packed, respond, sensitivity
 from orthaug.models.dynamics import Dynamics, Numbers
 
 RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
@@ -198,15 +198,17 @@ class FreeRunObjective:
             if long is None:
                 segments, states = self.colour, self.colour.start
             else:
-                errors = long if np.abs(long).max() < _LARGEST_ERROR else errors
+                if np.abs(long).max() < _LARGEST_ERROR:
+                    errors, segments = long, self.colour
         if errors is not None:
+            errors = packed(errors, segments)
             moved = np.moveaxis(errors, 1, -1).swapaxes(1, 2)  # (k, m, ny, T)
             shares = [
                 independent_share(moved[:, :, i].reshape(-1, moved.shape[-1])) for i in range(ny)
             ]
         else:
             shares = self._shares(point, segments, states)
-        return self.segments.count * ny - self.physics, float(np.mean(shares))
+        return int(np.sum(self.segments.observations)) - self.physics, float(np.mean(shares))
 
     def _colour_errors(self, point: TrialPoint) -> Any:
         """Return the errors of the longer segments.
@@ -258,10 +260,8 @@ def errors_of(
 ) -> Float[np.ndarray, "k T ny m"]:
     """Return the errors of every segment from its state, in the outputs' units.
 
-    0 where they are not scored.
+    0 where they are not scored or not measured.
     """
     run = np.asarray(respond(dynamics, numbers, segments, states))
     with np.errstate(all="ignore"):
-        return np.where(
-            np.asarray(segments.scored)[:, :, None], np.asarray(segments.target) - run, 0.0
-        )
+        return np.where(segments.measured, np.asarray(segments.target) - run, 0.0)

@@ -47,7 +47,8 @@ def _errors(
     dynamics: Dynamics, numbers: Numbers, segments: Segments, states: Any
 ) -> Float[Array, "T ny m"]:
     run = chunk_response(dynamics, dynamics.prepare(numbers), states, segments.inputs)
-    return jnp.where(segments.scored[:, None], segments.target - run, 0.0)
+    there = segments.scored[:, None] & ~jnp.isnan(segments.target)
+    return jnp.where(there, segments.target - run, 0.0)
 
 
 @dataclass(frozen=True)

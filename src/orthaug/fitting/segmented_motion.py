@@ -230,7 +230,7 @@ class SegmentedMotion(SegmentedProblem):
             start = self.settle(c, w, first, 30)
             errors = errors_of(self.dynamics, self.numbers(c, w), start, self.whole)
             scaled = errors / self.deviation[:, None]
-            mean = float(np.sum(scaled**2)) / (self.whole.count * len(self.dynamics.outputs))
+            mean = float(np.sum(scaled**2)) / int(self.whole.observations.sum())
         return mean if mean < RUNAWAY else np.nan
 
     def runs(self, c: AnyArray, w: Any, states: np.ndarray) -> Float[np.ndarray, "k T n0 m"]:

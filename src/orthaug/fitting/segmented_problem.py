@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, padded_length
@@ -144,7 +144,12 @@ class SegmentedProblem:
     @property
     def residuals(self) -> int:
         """Number of scored errors."""
-        return self.segments.count * len(self.dynamics.outputs)
+        return int(self.observations.sum())
+
+    @property
+    def observations(self) -> Int[np.ndarray, "ny"]:
+        """Number of scored errors of each output."""
+        return self.segments.observations
 
     def numbers(self, c: AnyArray, w: Vector, tilt: Any = None) -> Numbers:
         """Return the model's numbers before the split."""
@@ -240,12 +245,12 @@ class SegmentedProblem:
     def noise(self, objective: FreeRunObjective, end: Descent) -> Matrix | None:
         """Return the covariance (ny, ny) of the errors, in the outputs' units."""
         squares, ny = objective.squares(end.point), len(objective.weight)
+        if squares is None:
+            return None
+        if not self.record.complete:  # whitened errors of one row need all its outputs
+            squares = np.diag(np.diag(squares))
         used = (objective.physics + end.effective) / ny
-        return (
-            None
-            if squares is None
-            else noise_covariance(squares, np.full(ny, self.segments.count - used))
-        )
+        return noise_covariance(squares, self.observations - used)
 
     def mean_square(self, c: Vector, w: Vector, tilt: Any = None) -> float:
         """Return the mean of squared errors over whole experiments.
@@ -263,5 +268,5 @@ class SegmentedProblem:
                     self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole
                 )
                 total = float(np.sum((errors / self.deviation[:, None]) ** 2))
-            mean = total / (self.whole.count * len(self.dynamics.outputs))
+            mean = total / int(self.whole.observations.sum())
         return mean if mean < RUNAWAY else np.nan

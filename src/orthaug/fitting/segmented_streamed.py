@@ -361,6 +361,12 @@ class SourceSegments:
     start: Float[np.ndarray, "k n0 m"]
     there: Any
     """(k, m), which are scored anywhere."""
+    outputs: int
+
+    @property
+    def observations(self) -> Int[np.ndarray, "ny"]:
+        """Number of scored steps of each output: none is missing."""
+        return np.full(self.outputs, self.count)
 
     @classmethod
     def cut(
@@ -402,4 +408,6 @@ class SourceSegments:
         read = engine.read(cutting, parts, [-(-n // width) for n in counts])
         kept, count = engine.keep(SegmentStarts(), read)
         start, there = engine.fetch(kept)
-        return cls(read, steps, int(count), np.asarray(start), np.asarray(there))
+        return cls(
+            read, steps, int(count), np.asarray(start), np.asarray(there), len(dynamics.outputs)
+        )

@@ -29,7 +29,8 @@ _LANES = 4  # segments side by side: fewer take as long, and have the same progr
 class Segments(NamedTuple):
     """Segments of T steps in chunks of m; the last axis counts segments.
 
-    Steps that are not scored may be padding.
+    Steps that are not scored may be padding. An output that was not measured at a scored step is NaN
+    in `target`, and its error is 0.
     """
 
     start: Float[AnyArray, "k n0 m"]
@@ -42,6 +43,21 @@ class Segments(NamedTuple):
     def count(self) -> int:
         """Number of scored steps."""
         return int(np.sum(np.asarray(self.scored)))
+
+    @property
+    def measured(self) -> Bool[np.ndarray, "k T ny m"]:
+        """The outputs that were measured at scored steps."""
+        return np.asarray(self.scored)[:, :, None] & ~np.isnan(np.asarray(self.target))
+
+    @property
+    def complete(self) -> Bool[np.ndarray, "k T m"]:
+        """The scored steps at which every output was measured."""
+        return self.measured.all(axis=2)
+
+    @property
+    def observations(self) -> Int[np.ndarray, "ny"]:
+        """Number of scored steps at which each output was measured."""
+        return self.measured.sum(axis=(0, 1, 3))
 
     @property
     def steps(self) -> int:
@@ -95,6 +111,17 @@ def build_segments(
     stacked = (np.stack(part, axis=-1) for part in zip(*pieces, strict=True))
     cut = (np.moveaxis(part.reshape(*part.shape[:-1], chunks, width), -2, 0) for part in stacked)
     return Segments(*map(jax.device_put, cut))
+
+
+def packed(errors: Float[np.ndarray, "k T ny m"], segments: Segments) -> np.ndarray:
+    """Return errors with those of measured outputs first, then zeros.
+
+    Neighbours are then neighbours among what was measured. Where nothing is missing, they stay.
+    """
+    if not np.isnan(np.asarray(segments.target)).any():
+        return errors
+    order = np.argsort(~segments.measured, axis=1, kind="stable")
+    return np.take_along_axis(errors, order, axis=1)
 
 
 def few_lanes(steps: int) -> int:
@@ -205,12 +232,13 @@ def chunk_sensitivity(
     )
 
 
-def _columns(scored: Array, slope: Array, error: Array, weight: Array) -> Array:
+def _columns(scored: Array, slope: Array, target: Array, value: Array, weight: Array) -> Array:
     """Return derivatives and error of scored steps side by side (ny, n0 + n + 1, …).
 
-    Rows are multiplied by `weight`.
+    Both are 0 where the output was not measured. Rows are multiplied by `weight`.
     """
-    columns = jnp.where(scored, jnp.concatenate([slope, error[:, None]], axis=1), 0.0)
+    there = (scored & ~jnp.isnan(target))[:, None]
+    columns = jnp.where(there, jnp.concatenate([slope, (target - value)[:, None]], axis=1), 0.0)
     return (
         jnp.einsum("oi,in...->on...", weight, columns)
         if len(weight) > 1
@@ -232,7 +260,7 @@ def _step_by_step(
         state, slopes = carry
         inputs, target, scored = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
-        return (state, slopes), _columns(scored, slope, target - value, weight)
+        return (state, slopes), _columns(scored, slope, target, value, weight)
 
     def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
         *running, shared, own = carry
@@ -297,7 +325,7 @@ def _steps_at_once(
         slopes, before = jax.lax.scan(follow, slopes, tuple(by_step))
         before = jnp.moveaxis(before, 0, -2)  # (n0, n0 + n, size, width)
         slope = sum(to_state[n0:, i, None] * before[None, i] for i in range(n0)) + own_slopes[n0:]
-        columns = _columns(scored, slope, jnp.moveaxis(target, 0, -2) - value[n0:], weight)
+        columns = _columns(scored, slope, jnp.moveaxis(target, 0, -2), value[n0:], weight)
         return (state, slopes, *_with_sums(shared, own, columns, n0)), None
 
     return jax.lax.scan(block, carry, _cut(rows, most))[0][2:]
@@ -333,7 +361,7 @@ def block_scores(
         state, slopes, sums = carry
         inputs, target, scored, block = row
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
-        columns = _columns(scored, slope, target - value, weight)
+        columns = _columns(scored, slope, target, value, weight)
         return (
             state,
             slopes,

@@ -255,7 +255,8 @@ class SimulationTask(ABC):
         """Return noise covariance of the free run, and Cov θ̂ from its sensitivities."""
         end, objective = run.end, run.objective
         theta, nt = end.point.theta, objective.physics
-        freedom = self.plan.segments.count - (nt + end.effective) / len(objective.weight)
+        freedom = float(self.plan.observations.mean())
+        freedom -= (nt + end.effective) / len(objective.weight)
         noise = self.plan.noise(objective, end)
         held = () if objective.bounds is None else zip(theta, *objective.bounds, strict=True)
         at_bound = {i: float(value) for i, (value, *ends) in enumerate(held) if value in ends}

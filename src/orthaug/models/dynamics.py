@@ -137,6 +137,11 @@ class Dynamics(Protocol):
         ...
 
     @property
+    def takes_gaps(self) -> bool:
+        """True if the outputs of a record may be missing on some rows."""
+        ...
+
+    @property
     def separates(self) -> bool:
         """True if a step gives its output in the parts of physics and learner.
 
@@ -308,6 +313,7 @@ class AutodiffDynamics:
     entries: tuple[Expression, ...] = ()
     separates = False
     steps_unevenly = False
+    takes_gaps = False
     differentiable = True
     calls_host = False
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, Array, jax, jnp
-from orthaug.data.record import Experiment, Record
+from orthaug.data.record import Experiment, Record, without_gaps
 from orthaug.models.dynamics import Numbers, Parts
 from orthaug.models.kalman import (
     Filter,
@@ -22,7 +22,6 @@ from orthaug.models.kalman import (
     StateEstimate,
     correct,
     slope,
-    without_gaps,
 )
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics

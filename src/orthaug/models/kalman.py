@@ -290,22 +290,6 @@ def predict_outputs(
     )
 
 
-def without_gaps(outputs: Matrix) -> Matrix:
-    """Return outputs whose missing samples are interpolated linearly between the measured ones.
-
-    Zero where there are none.
-    """
-    filled = outputs.copy()
-    for column in filled.T:
-        there = np.isfinite(column)
-        column[~there] = (
-            np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
-            if there.any()
-            else 0.0
-        )
-    return filled
-
-
 def spread_of(covariance: np.ndarray) -> Vector:
     """Return standard deviations, of one covariance or of many."""
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))

@@ -60,6 +60,7 @@ class LaggedDynamics:
 
     separates = True
     steps_unevenly = False
+    takes_gaps = False
     calls_host = False
 
     @property

@@ -186,6 +186,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     linear = False
     separates = False
     steps_unevenly = True
+    takes_gaps = True
     first_row = 0
     memory = 0
 

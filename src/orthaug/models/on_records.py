@@ -149,7 +149,7 @@ class RecordModel(Generic[Form]):
             for e in record.experiments
         )
         fitting = Record(self.inputs, wanted["outputs"], record.sampling_time, experiments)
-        if not gaps:
+        if not (gaps or self.form.takes_gaps and not self.coloured):
             fitting.check_measured()
         return fitting
 

@@ -29,7 +29,7 @@ _SETTLED = 1e-10  # relative decrease that is not worth a step
 class Windows(NamedTuple):
     """Stretches of measured rows side by side; the last axis counts them.
 
-    Only rows that are scored count.
+    Only rows that are scored count, and only outputs that were measured: others are NaN.
     """
 
     inputs: Float[Any, "T nu m"]
@@ -178,7 +178,7 @@ def _gram(
         # Products of lanes are no matrix products
         slope = sum(slope[:, i, None] * slopes[None, i] for i in range(n0))
         columns = jnp.concatenate([slope[n0:], (target - value[n0:])[:, None]], axis=1)
-        columns = jnp.where(there, columns, 0.0)
+        columns = jnp.where((there & ~jnp.isnan(target))[:, None], columns, 0.0)
         columns: Any = sum(weight[:, i, None, None] * columns[None, i] for i in range(len(weight)))
         gram = gram + sum(column[:n0, None] * column[None] for column in columns)
         square = square + sum(column[n0] ** 2 for column in columns)

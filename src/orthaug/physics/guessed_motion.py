@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float, Int
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
-from orthaug.data.record import Record
+from orthaug.data.record import Record, without_gaps
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
@@ -192,7 +192,7 @@ def guess(
     sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
     """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
-    rows = np.asarray(rows, dtype=int)
+    rows, outputs = np.asarray(rows, dtype=int), without_gaps(outputs)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
     level = np.zeros((2, len(rows), outputs.shape[1]))

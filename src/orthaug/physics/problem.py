@@ -127,7 +127,7 @@ class PosedProblem:
     @property
     def largest_output(self) -> Vector:
         """The largest size of each output (ny,)."""
-        return np.max([np.abs(e.outputs).max(axis=0) for e in self.record.experiments], axis=0)
+        return np.array([np.abs(samples).max() for samples in self.record.measured])
 
     def physics_alone(self) -> PosedProblem:
         """Return the problem without a learner."""
@@ -550,19 +550,16 @@ def pose_motion(
     if not record.even:
         motion.check_paced(record)
     motion, learner_inputs = add_memory(motion, learner_inputs, memory, record)
-    record.check_measured()
     check_output_weights(output_weights, len(outputs))
-    for i, name in enumerate(outputs):
-        if (
-            min(np.ptp(e.outputs[:, i]) for e in record.experiments)
-            == max(np.ptp(e.outputs[:, i]) for e in record.experiments)
-            == 0.0
-        ):
+    for name, *samples in zip(outputs, *(one.measured for one in _each(record)), strict=True):
+        if not any(map(len, samples)):
+            raise InputError(f"channel '{name}' has no measured sample; leave it out.")
+        if all(np.ptp(own) == 0.0 for own in samples if len(own)):
             raise InputError(
                 f"channel '{name}' is constant over all training data; nothing can be learned "
                 "from it."
             )
-    deviation = np.concatenate([e.outputs for e in record.experiments]).std(axis=0)
+    deviation = np.array([samples.std() for samples in record.measured])
     deviation = np.where(deviation > 0, deviation, 1.0)
     problem = MotionProblem(
         record=record,
@@ -573,6 +570,10 @@ def pose_motion(
     )
     check_start(problem)
     return problem
+
+
+def _each(record: Record) -> list[Record]:
+    return [replace(record, experiments=(experiment,)) for experiment in record.experiments]
 
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:
