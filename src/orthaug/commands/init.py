@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import tomlkit
+from jaxtyping import Bool
 
 from orthaug._base.errors import InputError, MissingSampleError
 from orthaug._base.folders import whole_file
@@ -22,7 +23,7 @@ from orthaug.data.columns import Column
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
-from orthaug.data.record import Channel, Record
+from orthaug.data.record import Channel, Record, without_gaps
 from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
 from orthaug.physics.motion import Motion
@@ -56,6 +57,11 @@ class Roles:
     reason: str = ""
     thinned: int = 1
     """Factor by which the rows are thinned, behind a low-pass."""
+    every: int = 1
+    first: int = 0
+    """Rows in use, where the outputs have a value in every n-th row only, from the first one."""
+    keeps: bool = False
+    """True if rows without a value of an output stay: equations of motion run through them."""
 
 
 def channel_names(columns: Sequence[Column]) -> list[str]:
@@ -182,16 +188,19 @@ def _data(
         data.add("experiment", apart.header)
         data["experiment"].comment("its rows of one number are an experiment")
     uneven = time is not None and not clock.even
-    if gaps or uneven:
-        data.add("missing", "skip")
-        data["missing"].comment(gaps or "nothing is interpolated across gaps")
-    for name, part in (("train", [0, cut]), ("tests", [cut, rows])):
+    if gaps or uneven or roles.every > 1:
+        data.add("missing", "keep" if roles.keeps else "skip")
+        sampled = f"one row in {roles.every} has every output" if roles.every > 1 else ""
+        data["missing"].comment(gaps or sampled or "nothing is interpolated across gaps")
+    for name, part in (("train", [roles.first, cut]), ("tests", [cut, rows])):
         if part[0] == part[1]:
             continue
         entry = tomlkit.inline_table()
         pieces = _pieces(found, *part)
         rows_of = [list(piece) for piece in pieces]
         entry.update({"files": [file], "rows": rows_of if len(pieces) > 1 else rows_of[0]})
+        if roles.every > 1:
+            entry.update({"every": roles.every})
         if name == "train":
             data.add("train", entry)
         else:
@@ -265,6 +274,7 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
 Names = str | Sequence[str]  # columns, several in a text separated by commas
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
+_REGULAR = 0.8  # of the rows that lie in every n-th
 _POWER = 0.95  # of an output, within its band
 _CLEARLY_LESS = 0.7  # of the error of a free run: with it fewer rows are taken
 _LOST = 10.0  # error over the output's deviation, of a free run that leaves it
@@ -463,10 +473,11 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
         InputError: too few rows, or channels without a row where all have a value.
     """
     found = found.beside([*roles.inputs, *roles.outputs])
+    roles = _with_sampled_rows(roles, motion=system is not None)
     rows, missing = _extent(roles)
-    cut = round(TRAINED * rows)
-    cut = cut if rows - cut >= _TESTED else rows
-    record, lost = _record(found, roles, (0, cut), missing)
+    cut = round(TRAINED * (rows - roles.first) / roles.every) * roles.every + roles.first
+    cut = cut if rows - cut >= _TESTED * roles.every else rows
+    record, lost = _record(found, roles, (roles.first, cut), missing)
     fed = feedback_in(record)
     model = first_model(record, direct=not fed)
     if model is None:
@@ -534,7 +545,7 @@ def _thinned(
             continue
         fewer = replace(roles, thinned=by)
         with suppress(InputError):
-            own = _record(found, fewer, (0, cut), 0)[0]
+            own = _record(found, fewer, (roles.first, cut), 0)[0]
             other = first_model(own, direct=direct)
             if other is None or not record.inputs or (other.restarted and not restarted):
                 continue
@@ -606,12 +617,40 @@ def _extent(roles: Roles) -> tuple[int, int]:
     """Return the number of rows up to the last value of any channel, and of those that lack one."""
     columns = [*roles.inputs, *roles.outputs]
     rows = max(column.filled for column in columns)
+    return rows, int((~_complete(columns, rows))[roles.first :: roles.every].sum())
+
+
+def _complete(columns: Sequence[Column], rows: int) -> Bool[np.ndarray, "rows"]:
+    """Return the rows in which every column has a value."""
     there = np.ones(rows, dtype=bool)
     for column in columns:
         own = np.zeros(rows, dtype=bool)
         own[: len(column.values)] = np.isfinite(column.values[:rows])
         there &= own
-    return rows, int((~there).sum())
+    return there
+
+
+def _with_sampled_rows(roles: Roles, *, motion: bool) -> Roles:
+    """Return the roles with the rows in use, where outputs lack values beside complete inputs.
+
+    Equations of motion run through all of them. Lags need rows with all outputs: every n-th, where
+    the slowest sensor gives a value in these.
+    """
+    rows = max(column.filled for column in (*roles.inputs, *roles.outputs))
+    there = _complete(roles.outputs, rows)
+    if there.all():
+        return roles
+    if motion:
+        return replace(roles, keeps=bool(_complete(roles.inputs, rows).all()))
+    at = np.flatnonzero(there)
+    every = int(np.median(np.diff(at))) if len(at) > 2 else 1
+    if every < 2:
+        return roles
+    first = int(np.bincount(at % every).argmax())
+    kept = there[first::every]
+    if kept.mean() < _REGULAR or kept.sum() < _REGULAR * len(at):
+        return roles
+    return replace(roles, every=every, first=first)
 
 
 def _pieces(found: Survey, start: int, stop: int) -> list[tuple[int, int]]:
@@ -628,13 +667,19 @@ def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) ->
     )
     options: dict[str, Any] = {
         "rows": _pieces(found, *rows),
-        "missing": "skip" if missing or not found.clock.even else "error",
+        "missing": "skip" if missing or not found.clock.even or roles.every > 1 else "error",
+        "every": roles.every,
     }
+    if roles.keeps:
+        options["missing"] = "keep"
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
     try:
         record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
+        if roles.keeps:
+            filled = [replace(e, outputs=without_gaps(e.outputs)) for e in record.experiments]
+            record = replace(record, experiments=tuple(filled))
     except MissingSampleError:  # more samples in a row were wild than a gap is filled over
         record = read_record(
             found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"}
@@ -684,7 +729,14 @@ def _account(
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
         lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
-    if missing:
+    if roles.every > 1:
+        lines.append(
+            f"one row in {roles.every} has a value of every output: these rows are used. A "
+            '[motion] would use all (missing = "keep")'
+        )
+    if missing and roles.keeps:
+        lines.append(f"{gap_text(missing)} of an output and stay: the motion runs through them")
+    elif missing:
         kinds = [kind for kind, _ in steps_of(found, roles)]
         filled = "fill" in kinds
         lines.append(f"{gap_text(missing)} and will be left out, with all windows that touch them")

@@ -156,7 +156,12 @@ def label(
 
 
 def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve to draw; of a long one the extremes in every column of pixels."""
+    """Return a curve to draw; of a long one the extremes in every column of pixels.
+
+    It goes across rows without a value.
+    """
+    if not (there := np.isfinite(values)).all():
+        time, values = time[there], values[there]
     if len(values) <= 4 * _COLUMNS:
         return time, values
     starts = np.linspace(0, len(values), _COLUMNS, endpoint=False).astype(int)

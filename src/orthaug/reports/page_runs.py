@@ -6,6 +6,7 @@ The page draws the minimum and maximum of every curve in each column of pixels, 
 from __future__ import annotations
 
 import base64
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.data.record import Channel
+from orthaug.data.record import Channel, without_gaps
 from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Plot, area, number, percent
 
@@ -206,13 +207,15 @@ class _Panels:
         self.measured = (
             None if any(m is None for m in measured) else join_experiments(response, measured)
         )
+        begins = np.cumsum([0, *(len(t.model) + 1 for t in response.trajectories)])
+        self._ranges = [slice(a, b - 1) for a, b in itertools.pairwise(begins)]
+        self.gaps = any(m is not None and bool(np.isnan(m).any()) for m in measured)
         self.rows = sum(len(t.model) + 1 for t in response.trajectories) - 1
         self.traces: list[dict[str, Any]] = []
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         self.series: dict[str, Any] = {}
         self._left: list[PanelExit] = []
         self._shown: tuple[float, float] | None = None
-        begins = np.cumsum([0, *(len(t.model) + 1 for t in response.trajectories)])
         self._lost = next(
             (
                 int(begin) + t.diverged[0]
@@ -223,7 +226,11 @@ class _Panels:
         )
 
     def keep(self, name: str, i: int, values: Matrix) -> str:
-        """Return the name by which traces find the curve of output i."""
+        """Return the name by which traces find the curve of output i.
+
+        What was measured goes across rows without a sample.
+        """
+        values = self._across(values) if name == "measured" else values
         self.series[f"{name} {i}"] = pack_curve(values[:, i], self.start, self.step, self.most)
         return f"{name} {i}"
 
@@ -231,13 +238,20 @@ class _Panels:
         """Draw measured less a curve that is kept, as their difference or as a curve of its own."""
         assert self.measured is not None
         own: dict[str, Any] = {"minus": [f"measured {i}", f"{name} {i}"]}
-        if len(model) > self.most:
-            key = f"measured {i} − {name} {i}"
-            self.series[key] = pack_curve(
-                self.measured[:, i] - model[:, i], self.start, self.step, self.most
-            )
+        if len(model) > self.most or self.gaps:
+            key, residual = f"measured {i} − {name} {i}", self._across(self.measured - model)
+            self.series[key] = pack_curve(residual[:, i], self.start, self.step, self.most)
             own = {"series": key}
         self.traces.append({**own, **drawn, "yaxis": f"y{2 * i + 2}", "showlegend": False})
+
+    def _across(self, values: Matrix) -> Matrix:
+        """Return values (N, ny) with straight lines across rows without a sample."""
+        if not self.gaps:
+            return values
+        filled = values.copy()
+        for rows in self._ranges:
+            filled[rows] = without_gaps(values[rows])
+        return filled
 
     def finish(self, i: int, drawn: Mapping[str, Matrix]) -> None:
         """Draw the axes of output i, and mark where the curves in `drawn` leave them."""
@@ -257,6 +271,8 @@ class _Panels:
                 "at the triangle;"
             )
             caption += f" it goes to {reached}."
+        if self.gaps:
+            caption += " Lines join measured values across rows without one."
         whole = (self.start, self.start + self.step * (self.rows - 1))
         shown = self._shown
         if shown is not None:

@@ -73,14 +73,13 @@ def output_figure(response: Response, title: str, *, learns: bool = False) -> Fi
     for i, channel in enumerate(response.outputs):
         upper, lower = axes[2 * i], axes[2 * i + 1]
         if trajectory.measured is not None:
-            upper.plot(
-                time, trajectory.measured[rows, i], color=GREY, linewidth=2.6, label="measured"
-            )
+            measured = outline(time, trajectory.measured[rows, i])
+            upper.plot(*measured, color=GREY, linewidth=2.6, label="measured")
         for name, values, color, of_error, style in drawn:
             upper.plot(time, values[rows, i], style, color=color, linewidth=0.9, label=name)
             if trajectory.measured is not None:
                 error = trajectory.measured[rows, i] - values[rows, i]
-                lower.plot(time, error, style, color=of_error, linewidth=0.9)
+                lower.plot(*outline(time, error), style, color=of_error, linewidth=0.9)
         label(upper, y=channel.label)
         label(lower, y=with_unit("difference", channel.unit))
         legend(upper)
