@@ -16,6 +16,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.data.gaps import complete_record
 from orthaug.data.record import Record
 
 _LEVEL = 0.001  # of the test, divided by the number of inputs
@@ -51,7 +52,10 @@ def feedback_in(record: Record) -> tuple[Feedback, ...]:
 
     Nothing can be said of an input that its own past predicts.
     """
-    found = []
+    found, complete = [], complete_record(record)
+    if complete is None:
+        return ()
+    record = complete
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
             tested = _input_share(record, j)

@@ -125,8 +125,7 @@ def _measured_regressors(
         raise InputError(
             f"`x` has shape {np.shape(x)}; the usable regressors of the record have {wanted}."
         )
-    outputs = np.concatenate([e.outputs for e in record.experiments])
-    return x, RowIndex.of(lengths, form.first_row), positive(outputs.std(axis=0))
+    return x, RowIndex.of(lengths, form.first_row), positive(record.deviation)
 
 
 def _gradients(form: LaggedDynamics, numbers: Numbers, x: Matrix) -> Iterator[list[Any]]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from orthaug._base.checks import Vector
+from orthaug.data.gaps import complete_record
 from orthaug.data.record import Experiment, Record
 
 _LONGEST, _SHORTEST, _SEGMENTS = 4096, 64, 8
@@ -47,12 +48,15 @@ class MeasuredResponse:
 
 def measured_response(record: Record) -> MeasuredResponse | None:
     """Return the response of a record with inputs and outputs; None where it is too short."""
-    if not record.inputs or not record.outputs or max(map(len, record.experiments)) < _FEWEST_ROWS:
+    if not record.inputs or not record.outputs:
         return None
-    period = _period(record)
+    complete = complete_record(record)
+    if complete is None or max(map(len, complete.experiments)) < _FEWEST_ROWS:
+        return None
+    period = _period(complete)
     if period is not None:
-        return _by_periods(record, period)
-    return _welch(record)
+        return _by_periods(complete, period)
+    return _welch(complete)
 
 
 def _welch(record: Record) -> MeasuredResponse:

@@ -181,7 +181,7 @@ def cross_validate(
         InputError: too few rows for so many blocks.
     """
     folds = held_out_blocks(record, blocks, start)
-    unit = np.std(np.concatenate([e.outputs for e in record.experiments]), axis=0)
+    unit = record.deviation
 
     return list(runner.map(_on_block, (tuple(fits), unit), folds))
 

@@ -175,7 +175,7 @@ def sample_free_run(model: Model, record: Record, free_run: Response, most: int)
         pieces.append((states, inputs[rows - start]))
     visited, inputs = (np.concatenate(piece) for piece in zip(*pieces, strict=True))
     points = RunPoints(visited, inputs, some)
-    unit = _units(form, points, np.concatenate([e.outputs for e in record.experiments]))
+    unit = _units(form, points, record.deviation)
     diverged = tuple(
         f"{t.diverged[1]} at experiment {i}, {e.where(t.diverged[0])}"
         for i, (e, t) in enumerate(zip(record.experiments, runs, strict=True))
@@ -184,14 +184,14 @@ def sample_free_run(model: Model, record: Record, free_run: Response, most: int)
     return RunSample(points, len(every), unit, diverged)
 
 
-def _units(form: Dynamics, points: RunPoints, outputs: Matrix) -> Vector:
+def _units(form: Dynamics, points: RunPoints, deviation: Vector) -> Vector:
     """Return one over what an entry costs in deviations of the outputs.
 
     Its own deviation where it is free.
     """
     if not len(points):
         return np.ones(form.states)  # of what may be too long for a matrix
-    per_output = positive(outputs.std(axis=0))
+    per_output = positive(deviation)
     cost = np.linalg.norm(form.start_rows(np.diag(1 / per_output)), axis=0)
     return np.where(cost > 0, 1 / positive(cost), positive(points.states.std(axis=0)))
 

@@ -20,6 +20,7 @@ from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.opening import pose_job
 from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec, spec_model
+from orthaug.data.gaps import filled_record
 from orthaug.data.record import Experiment, Record
 from orthaug.inference.measures import Symmetrized, Training, Uniform
 from orthaug.reports.recovery import DECLARED
@@ -175,7 +176,7 @@ def _plant(plan: Plan, suspect: Any, share: float | None) -> Planted | str:
     if size is None:
         return "zero on these rows, or a combination of the physics there"
     record, planted = plan.job.train.record, Planted(suspect, size)
-    measured = np.concatenate([e.outputs for e in record.experiments])
+    measured = np.concatenate([e.outputs for e in filled_record(record).experiments])
     middle, reach = (measured.max(axis=0) + measured.min(axis=0)) / 2, np.ptp(measured, axis=0)
     for _ in range(_HALVINGS):
         quiet = [np.zeros_like(e.outputs) for e in record.experiments]
@@ -198,7 +199,7 @@ def _designed(job: Job) -> Record | None:
         return None
     signal = np.asarray(design_for(job).signal)
     names = [channel.name for channel in record.inputs]
-    longest = max(record.experiments, key=len)
+    longest = max(filled_record(record).experiments, key=len)
     inputs = np.resize(longest.inputs, (len(signal), len(names)))
     inputs[:, names.index(section.input or names[0])] = signal
     outputs = np.resize(longest.outputs, (len(signal), longest.outputs.shape[1]))
@@ -219,6 +220,7 @@ def simulated(plan: Plan, planted: Planted, record: Record, rng: np.random.Gener
         if not np.isfinite(outputs).all():
             raise InputError(f"the run with {planted.name} leaves all bounds under this noise.")
         outputs = outputs + noise if plan.at_output else outputs
+        outputs = np.where(np.isnan(experiment.outputs), np.nan, outputs)
         experiments.append(replace(experiment, outputs=outputs))
     return replace(record, experiments=tuple(experiments))
 

@@ -20,10 +20,11 @@ from orthaug.analysis.closed_loop import Feedback, feedback_in
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
+from orthaug.data.gaps import filled_record, regular_rows
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
-from orthaug.data.record import Channel, Record, without_gaps
+from orthaug.data.record import Channel, Record
 from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
 from orthaug.physics.motion import Motion
@@ -274,7 +275,6 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
 Names = str | Sequence[str]  # columns, several in a text separated by commas
 TRAINED = 0.75  # share of the rows; the rest is a test
 _TESTED = 30  # rows of a test at least
-_REGULAR = 0.8  # of the rows that lie in every n-th
 _POWER = 0.95  # of an output, within its band
 _CLEARLY_LESS = 0.7  # of the error of a free run: with it fewer rows are taken
 _LOST = 10.0  # error over the output's deviation, of a free run that leaves it
@@ -642,15 +642,8 @@ def _with_sampled_rows(roles: Roles, *, motion: bool) -> Roles:
         return roles
     if motion:
         return replace(roles, keeps=bool(_complete(roles.inputs, rows).all()))
-    at = np.flatnonzero(there)
-    every = int(np.median(np.diff(at))) if len(at) > 2 else 1
-    if every < 2:
-        return roles
-    first = int(np.bincount(at % every).argmax())
-    kept = there[first::every]
-    if kept.mean() < _REGULAR or kept.sum() < _REGULAR * len(at):
-        return roles
-    return replace(roles, every=every, first=first)
+    kept = regular_rows(there)
+    return roles if kept is None else replace(roles, every=kept.step, first=kept.start)
 
 
 def _pieces(found: Survey, start: int, stop: int) -> list[tuple[int, int]]:
@@ -677,9 +670,7 @@ def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) ->
         options["time"] = time_of(found, roles)
     try:
         record = read_record(found.path, inputs=inputs, outputs=outputs, **options)
-        if roles.keeps:
-            filled = [replace(e, outputs=without_gaps(e.outputs)) for e in record.experiments]
-            record = replace(record, experiments=tuple(filled))
+        record = filled_record(record)  # a motion runs through gaps
     except MissingSampleError:  # more samples in a row were wild than a gap is filled over
         record = read_record(
             found.path, inputs=inputs, outputs=outputs, **{**options, "missing": "skip"}

@@ -163,8 +163,9 @@ Initial = Annotated[
 Missing = Annotated[
     str,
     typer.Option(
-        "--missing", metavar="error|skip|keep",
-        help="Rows with missing cells: skip leaves them out, keep simulates a motion through them."
+        "--missing",
+        metavar="error|skip|keep",
+        help="Rows with missing cells: skip leaves them out, keep simulates a motion through them.",
     ),
 ]
 Rows = Annotated[

@@ -482,6 +482,12 @@ class Record(NotebookView):
         columns = np.concatenate([experiment.outputs for experiment in self.experiments]).T
         return tuple(column[~np.isnan(column)] for column in columns)
 
+    @property
+    def deviation(self) -> Vector:
+        """The standard deviation of each output (ny,), of what was measured."""
+        values = np.concatenate([experiment.outputs for experiment in self.experiments])
+        return values.std(axis=0, where=True if self.complete else ~np.isnan(values))
+
     def check_measured(self) -> None:
         """Raise InputError where an output is missing.
 

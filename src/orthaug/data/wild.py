@@ -17,6 +17,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
 from orthaug.data.columns import quantum_of
+from orthaug.data.gaps import complete_record, filled_record
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -149,13 +150,16 @@ def data_warnings(
     Args:
         effect: says in a sentence what a fit without some samples gives.
     """
+    complete, record = complete_record(record), filled_record(record)
     found, samples = [], wild_samples(record)
     for name in dict.fromkeys(sample.name for sample in samples):
         own = tuple(sample for sample in samples if sample.name == name)
         found.append(
             Warning("wild_samples", _wild_text(record, own, effect(samples) if effect else ""))
         )
-    return [*found, *_repeat_warnings(record), *_frozen_warnings(record)]
+    if complete is None:
+        return found
+    return [*found, *_repeat_warnings(complete), *_frozen_warnings(complete)]
 
 
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:

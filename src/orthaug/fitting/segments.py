@@ -29,8 +29,8 @@ _LANES = 4  # segments side by side: fewer take as long, and have the same progr
 class Segments(NamedTuple):
     """Segments of T steps in chunks of m; the last axis counts segments.
 
-    Steps that are not scored may be padding. An output that was not measured at a scored step is NaN
-    in `target`, and its error is 0.
+    Steps that are not scored may be padding. An output that was not measured at a scored step is
+    NaN in `target`, and its error is 0.
     """
 
     start: Float[AnyArray, "k n0 m"]
@@ -52,7 +52,7 @@ class Segments(NamedTuple):
     @property
     def complete(self) -> Bool[np.ndarray, "k T m"]:
         """The scored steps at which every output was measured."""
-        return self.measured.all(axis=2)
+        return np.asarray(self.measured.all(axis=2))
 
     @property
     def observations(self) -> Int[np.ndarray, "ny"]:

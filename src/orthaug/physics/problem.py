@@ -559,7 +559,7 @@ def pose_motion(
                 f"channel '{name}' is constant over all training data; nothing can be learned "
                 "from it."
             )
-    deviation = np.array([samples.std() for samples in record.measured])
+    deviation = record.deviation
     deviation = np.where(deviation > 0, deviation, 1.0)
     problem = MotionProblem(
         record=record,

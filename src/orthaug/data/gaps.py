@@ -1,0 +1,75 @@
+"""Records whose outputs are missing on some rows: what tests can make of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool
+
+from orthaug.data.record import Experiment, Record, unbroken, without_gaps
+
+_REGULAR = 0.8  # of the rows that lie in every n-th
+_SHORTEST = 20  # rows of a stretch
+
+
+def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
+    """Return the every n-th rows in which a slow sensor gives its values; None without such n."""
+    at = np.flatnonzero(there)
+    every = int(np.median(np.diff(at))) if len(at) > 2 else 1
+    if every < 2:
+        return None
+    first = int(np.bincount(at % every).argmax())
+    kept = there[first::every]
+    if kept.mean() < _REGULAR or kept.sum() < _REGULAR * len(at):
+        return None
+    return slice(first, None, every)
+
+
+def complete_record(record: Record) -> Record | None:
+    """Return the rows of a record on which all outputs were measured, as experiments of their own.
+
+    They are at even steps: every n-th row, where the slowest sensor gives its values there, or
+    the rows between gaps. None where no 20 rows are so. The record itself where nothing is missing.
+    """
+    if record.complete:
+        return record
+    thinned = [_regular(experiment) for experiment in record.experiments]
+    every = {rows.step for rows in thinned if rows is not None}
+    step, found = record.sampling_time, []
+    if len(every) == 1 and None not in thinned:
+        step *= next(iter(every))
+        for experiment, rows in zip(record.experiments, thinned, strict=True):
+            found += _stretches(_every(experiment, rows))  # type: ignore[arg-type]
+    else:
+        for experiment in record.experiments:
+            found += _stretches(experiment)
+    found = [one for one in found if len(one) >= _SHORTEST]
+    return replace(record, sampling_time=step, experiments=tuple(found)) if found else None
+
+
+def filled_record(record: Record) -> Record:
+    """Return a record whose missing outputs are interpolated between the measured ones."""
+    if record.complete:
+        return record
+    filled = (replace(one, outputs=without_gaps(one.outputs)) for one in record.experiments)
+    return replace(record, experiments=tuple(filled))
+
+
+def _regular(experiment: Experiment) -> slice | None:
+    return regular_rows(np.isfinite(experiment.outputs).all(axis=1))
+
+
+def _every(experiment: Experiment, rows: slice) -> Experiment:
+    return replace(
+        experiment,
+        inputs=experiment.inputs[rows],
+        outputs=experiment.outputs[rows],
+        first_row=experiment.first_row + experiment.stride * rows.start,
+        stride=experiment.stride * rows.step,
+        steps=None,
+    )
+
+
+def _stretches(experiment: Experiment) -> list[Experiment]:
+    return [experiment.rows(begin, end) for begin, end in unbroken(experiment.outputs)]
