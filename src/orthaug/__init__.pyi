@@ -26,6 +26,7 @@ from .data import Fill as Fill
 from .data import Lags as Lags
 from .data import Outliers as Outliers
 from .data import Record as Record
+from .data import Repeats as Repeats
 from .data import Resample as Resample
 from .data import open_frame as open_frame
 from .data import open_parquet as open_parquet

@@ -20,7 +20,7 @@ from orthaug.analysis.closed_loop import Feedback, feedback_in
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
 from orthaug.data.columns import Column
-from orthaug.data.gaps import filled_record, regular_rows
+from orthaug.data.gaps import filled_record, held_rows, regular_rows
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
@@ -61,6 +61,8 @@ class Roles:
     every: int = 1
     first: int = 0
     """Rows in use, where the outputs have a value in every n-th row only, from the first one."""
+    held: tuple[str, ...] = ()
+    """Outputs whose sensor is slower than the rows, between whose samples the last one is held."""
     keeps: bool = False
     """True if rows without a value of an output stay: equations of motion run through them."""
 
@@ -94,6 +96,8 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
             ("outliers", {"threshold": threshold}),
             ("fill", {"most": FILLED, "method": "pchip"}),
         ]
+    if roles.held:
+        steps.append(("repeats", {"channels": list(roles.held)}))
     if time_of(found, roles) and not found.clock.even:
         steps.append(("resample", {"sampling_time": found.clock.step}))
     if roles.thinned > 1:
@@ -189,9 +193,10 @@ def _data(
         data.add("experiment", apart.header)
         data["experiment"].comment("its rows of one number are an experiment")
     uneven = time is not None and not clock.even
-    if gaps or uneven or roles.every > 1:
+    if gaps or uneven or roles.every > 1 or roles.keeps:
         data.add("missing", "keep" if roles.keeps else "skip")
         sampled = f"one row in {roles.every} has every output" if roles.every > 1 else ""
+        sampled = "held samples are none" if roles.held else sampled
         data["missing"].comment(gaps or sampled or "nothing is interpolated across gaps")
     for name, part in (("train", [roles.first, cut]), ("tests", [cut, rows])):
         if part[0] == part[1]:
@@ -638,10 +643,16 @@ def _with_sampled_rows(roles: Roles, *, motion: bool) -> Roles:
     """
     rows = max(column.filled for column in (*roles.inputs, *roles.outputs))
     there = _complete(roles.outputs, rows)
-    if there.all():
+    sampled = [held_rows(column.values[:rows]) for column in roles.outputs]
+    held = tuple(c.name for c, own in zip(roles.outputs, sampled, strict=True) if own is not None)
+    if there.all() and not held:
         return roles
     if motion:
-        return replace(roles, keeps=bool(_complete(roles.inputs, rows).all()))
+        keeps = bool(_complete(roles.inputs, rows).all())
+        return replace(roles, keeps=keeps, held=held if keeps else ())
+    for own in sampled:
+        if own is not None:
+            there &= np.isin(np.arange(rows), np.arange(own.start, rows, own.step))
     kept = regular_rows(there)
     return roles if kept is None else replace(roles, every=kept.step, first=kept.start)
 
@@ -724,6 +735,12 @@ def _account(
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
             '[motion] would use all (missing = "keep")'
+        )
+    if roles.held:
+        names = join_words(roles.held)
+        lines.append(
+            f"{names}: a slower sensor, whose last value is held: repeats are no samples, and the "
+            "motion runs through them"
         )
     if missing and roles.keeps:
         lines.append(f"{gap_text(missing)} of an output and stay: the motion runs through them")

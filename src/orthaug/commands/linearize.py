@@ -54,7 +54,7 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None]:
 
         return load(model), None
     if data.suffix.lower() != ".toml":
-        opened = open_run(model, data, need_outputs=True, reading=ReadOptions(prepare=True))
+        opened = open_run(model, data, need_outputs=True, reading=ReadOptions("auto", prepare=True))
         return opened.model, opened.record
     from orthaug.models.storage import load
 

@@ -34,6 +34,7 @@ class ReadOptions:
     """The rows and columns of a data file to read, as a part of a spec declares them."""
 
     missing: str = "error"
+    """"error", "skip" or "keep", or "auto": keep where the model runs through gaps, else skip."""
     rows: Any = None
     """A half-open range of rows, or several; None for all."""
     every: int = 1
@@ -109,8 +110,13 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
             if digest in [file["sha256"] for file in content["data"]["train"]]:
                 part = content["spec"]["data"]["train"]
                 rows = np.reshape(part.get("rows") or [], (-1, 2)).astype(int).tolist() or None
+                kept = content["spec"]["data"].get("missing") == "keep"
                 return ReadOptions(
-                    "skip", rows, int(part.get("every") or 1), dict(part.get("columns") or {}), True
+                    "keep" if kept else "skip",
+                    rows,
+                    int(part.get("every") or 1),
+                    dict(part.get("columns") or {}),
+                    True,
                 )
     return None
 
@@ -127,7 +133,7 @@ def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | No
     for path in data:
         check_readable(path)
         trained = trained_reading(model, path)
-        reading = trained or ReadOptions("skip", prepare=True)
+        reading = trained or ReadOptions("auto", prepare=True)
         opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
@@ -193,7 +199,8 @@ def open_run(
     try:
         record = record_for(loaded, data, held, reading)
     except MissingSampleError as error:
-        raise InputError(f"{error} --missing skip leaves such rows out.") from None
+        keep = ", --missing keep runs through them" if loaded.form.takes_gaps else ""
+        raise InputError(f"{error} --missing skip leaves such rows out{keep}.") from None
     rows, notes = (
         len(record) + record.missing,
         prepared_notes(loaded, record if reading.prepare else None),
@@ -221,7 +228,9 @@ def record_for(
     Raises:
         InputError: as `read_record`.
     """
-    steps, step = (), model.sampling_time
+    steps, step, missing = (), model.sampling_time, reading.missing
+    if missing == "auto":
+        missing = "keep" if model.form.takes_gaps and not model.coloured else "skip"
     if reading.prepare:
         steps, step = steps_again(model.prepared, [c.name for c in (*model.inputs, *outputs)], step)
     return read_record(
@@ -233,7 +242,7 @@ def record_for(
         rows=reading.rows,
         every=reading.every,
         columns=reading.columns,
-        missing=reading.missing,
+        missing=missing,
         experiment=experiment_column(model, data),
         prepare=steps,
         uneven=model.form.steps_unevenly,

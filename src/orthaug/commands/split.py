@@ -51,7 +51,7 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
     read, notes = [], []
     for path, own in zip(data, trained, strict=True):
         # Of rows with missing cells none were trained on
-        reading = own or ReadOptions("skip", prepare=True)
+        reading = own or ReadOptions("auto", prepare=True)
         taken = rows_taken(reading)
         if rows is None:
             notes += [f"note: {path.name}: {taken}, those of the training."] if taken else []

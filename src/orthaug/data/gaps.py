@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
+from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
 from orthaug.data.record import Experiment, Record, unbroken, without_gaps
 
 _REGULAR = 0.8  # of the rows that lie in every n-th
@@ -24,6 +26,46 @@ def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
     if kept.mean() < _REGULAR or kept.sum() < _REGULAR * len(at):
         return None
     return slice(first, None, every)
+
+
+def held_rows(samples: Vector) -> slice | None:
+    """Return the every n-th rows at which a held signal is sampled anew; None without such n.
+
+    Between them it repeats the row before. A sample that is by chance as the last one counts as
+    sampled.
+    """
+    changed = np.concatenate([[False], samples[1:] != samples[:-1]])
+    at = np.flatnonzero(changed)
+    if len(at) < _SHORTEST or 2 * len(at) > len(samples):
+        return None
+    every = int(np.gcd.reduce(np.diff(at)))
+    first = int(at[0]) % every
+    if every < 2 or len(at) < _REGULAR * len(samples[first::every]):
+        return None
+    return slice(first, None, every)
+
+
+def held_warnings(record: Record) -> list[Warning]:
+    """Return a warning of each output that is sampled more slowly than the rows, and held."""
+    found = []
+    for j, output in enumerate(record.outputs):
+        every = [held_rows(experiment.outputs[:, j]) for experiment in record.experiments]
+        known = [rows for rows in every if rows is not None]
+        if not known or len(known) < len(every) or len({rows.step for rows in known}) > 1:
+            continue
+        n, first = known[0].step, known[0].start
+        place = record.experiments[0].where(first)
+        late = (n - 1) / 2 * record.sampling_time
+        text = (
+            f"{output.name} changes in every {n}th row only ({place} and so on): its sensor is "
+            f"slower than the rows, and its last value is held, {late:.3g} s old on average. A "
+            "model then takes the age for a lag of the system, and parameters move. For a "
+            f'[motion] mark repeats as missing (step = "repeats" in [[data.prepare]], `channels` '
+            f'= ["{output.name}"]) and give `missing` = "keep". For lagged physics read these '
+            f"rows only: `every` = {n}, `rows` from {first} on."
+        )
+        found.append(Warning("held_output", text))
+    return found
 
 
 def complete_record(record: Record) -> Record | None:
@@ -57,7 +99,7 @@ def filled_record(record: Record) -> Record:
 
 
 def _regular(experiment: Experiment) -> slice | None:
-    return regular_rows(np.isfinite(experiment.outputs).all(axis=1))
+    return regular_rows(np.asarray(np.isfinite(experiment.outputs).all(axis=1)))
 
 
 def _every(experiment: Experiment, rows: slice) -> Experiment:

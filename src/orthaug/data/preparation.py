@@ -9,12 +9,22 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge, Gt
 
-from orthaug._base.checks import Matrix, check_type
+from orthaug._base.checks import Matrix, check_choice, check_type
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.registry import OneOf, Registry, check_fields
 from orthaug.data.prepared import Preparation
 from orthaug.data.record import Experiment, Record, same_step, unbroken
-from orthaug.data.steps import Channels, Detrend, Fill, Outliers, Resample, Run, Shift, Step
+from orthaug.data.steps import (
+    Channels,
+    Detrend,
+    Fill,
+    Outliers,
+    Repeats,
+    Resample,
+    Run,
+    Shift,
+    Step,
+)
 
 # Chebyshev filter of decimation: order, dB, share of the new Nyquist
 _ANTI_ALIAS, _RIPPLE, _CORNER = (8, 0.05, 0.8)
@@ -165,19 +175,20 @@ STEPS = Registry(
         "decimate": Decimate,
         "resample": Resample,
         "outliers": Outliers,
+        "repeats": Repeats,
         "fill": Fill,
         "shift": Shift,
     },
     reserved=("step",),
 )
 _FILTERS = ("lowpass", "highpass", "decimate")
-MENDING = ("outliers", "fill")
+MENDING = ("outliers", "repeats", "fill")
 """Steps that leave good samples as they are."""
 SAMPLING = ("decimate", "resample")
 """Steps after which there are other instants."""
 
 
-def prepare(record: Record, *steps: Any) -> Record:
+def prepare(record: Record, *steps: Any, missing: str = "skip") -> Record:
     """Return a record after steps such as `Detrend()` and `Lowpass(cutoff=10.0)`, in this order.
 
     `.prepared` lists them.
@@ -185,6 +196,9 @@ def prepare(record: Record, *steps: Any) -> Record:
     Every step acts within an experiment, never across. Samples that are missing afterwards split
     experiments. Gaps that were left out when the record was read are not seen: to fill them give
     the steps to `read_record(prepare=…)`.
+
+    Args:
+        missing: "skip", or "keep" where outputs may be missing: a motion runs through these rows.
 
     Raises:
         InputError: no step, or one that cannot be done with these samples.
@@ -198,6 +212,7 @@ def prepare(record: Record, *steps: Any) -> Record:
     """
     check_type(record, Record, "record", "a Record")
     check_steps(steps)
+    check_choice(missing, ("skip", "keep"), "`missing`")
     runs = []
     if not record.even and not (steps and isinstance(steps[0], Resample)):
         record.check_even("preparation whose first step is not Resample()")
@@ -208,7 +223,7 @@ def prepare(record: Record, *steps: Any) -> Record:
         step, even = record.sampling_time, e.steps is None
         run = Run(values, instants, names, len(record.inputs), step, even=even)
         runs.append((run, e))
-    experiments, step, done, lost = prepared_experiments(runs, steps)
+    experiments, step, done, lost = prepared_experiments(runs, steps, keep=missing == "keep")
     changed = replace(
         record, experiments=experiments, sampling_time=step, missing=record.missing + lost
     )

@@ -8,6 +8,12 @@ from typing import Any
 
 from orthaug._base.errors import InputError
 
+_DONE = {
+    "outliers": "marked as missing",
+    "repeats": "marked as missing",
+    "fill": "reconstructed",
+}
+
 
 @dataclass(frozen=True)
 class Preparation:
@@ -31,7 +37,7 @@ class Preparation:
     @property
     def text(self) -> str:
         """The step with its options and the number of samples that it changed."""
-        done = {"outliers": "marked as missing", "fill": "reconstructed"}.get(self.step)
+        done = _DONE.get(self.step)
         samples = "1 sample" if self.samples == 1 else f"{self.samples} samples"
         return f"{self.named}: {samples} {done}" if done else self.named
 

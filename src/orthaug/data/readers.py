@@ -30,7 +30,7 @@ from orthaug.data.record import (
     steps_between,
     unbroken,
 )
-from orthaug.data.steps import Fill, Outliers, Resample, Run
+from orthaug.data.steps import Fill, Outliers, Repeats, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -72,7 +72,8 @@ def read_record(
         columns: this file's column for a channel, `{"position": "yVal"}`.
         missing: "error", or "skip" to leave out rows with empty or NaN cells. Each stretch between
             them is then an experiment of its own, so that no lag reaches across a gap. "keep" does
-            so where inputs are missing, and keeps missing outputs as NaN: an `Observer` takes them.
+            so where inputs are missing, and keeps missing outputs as NaN: a motion and an
+            `Observer` take them.
         experiment: the column, of numbers, that labels the experiments; each is in one piece.
         prepare: steps such as `Fill()` or `Lowpass(cutoff=10.0)`, in order, before missing samples
             are looked at; with `Resample()` the instants of `time` may be uneven.
@@ -191,7 +192,9 @@ class _RawRanges:
     def prepare(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
         """Return the record after the steps."""
         check_steps(steps)
-        mends = self.missing != "error" or any(isinstance(step, Outliers | Fill) for step in steps)
+        mends = self.missing != "error" or any(
+            isinstance(step, Outliers | Repeats | Fill) for step in steps
+        )
         uneven = any(isinstance(step, Resample) for step in steps)
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
         experiments, step, done, lost = prepared_experiments(

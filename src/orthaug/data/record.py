@@ -308,7 +308,8 @@ class Record(NotebookView):
             sampling_time: seconds between rows.
             inputs, outputs: names (or `Channel`s with units); default `u`, `y`, or `u1, u2, …`.
             source: where it came from, for messages.
-            missing: "error", or "keep" where outputs may be NaN for an `Observer`.
+            missing: "error", or "keep" where outputs may be NaN: a motion and an `Observer` run
+                through such rows.
             time: instants (N,) in s that rise unevenly, instead of `sampling_time`, which is then
                 their mean step. Equations of motion step from each to the next.
 
@@ -497,9 +498,9 @@ class Record(NotebookView):
             bad = np.flatnonzero(np.isnan(experiment.outputs).any(axis=1))
             if bad.size:
                 raise InputError(
-                    f"{experiment.where(int(bad[0]))}: an output is missing, which lagged physics "
-                    "needs on every row; leave "
-                    'such rows out (`missing = "skip"`), or state the physics as a [motion].'
+                    f"{experiment.where(int(bad[0]))}: an output is missing, which is accepted "
+                    "only by a motion in memory whose errors are white, and by an Observer; leave "
+                    'such rows out (`missing = "skip"`).'
                 )
 
     def rows(self, start: int | None = None, stop: int | None = None) -> Record:

@@ -263,6 +263,34 @@ class Outliers:
 
 
 @dataclass(frozen=True)
+class Repeats:
+    """Step that marks samples equal to the one before as missing.
+
+    A sensor that is slower than the rows, and whose last value is held, was sampled at the others.
+
+    Args:
+        channels: names; None for the outputs.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=[0.0] * 4, y=[1.0, 1.0, 3.0, 3.0])
+        >>> prepare(record, Repeats(), missing="keep").experiments[0].outputs.ravel()
+        array([ 1., nan,  3., nan])
+    """
+
+    channels: Channels = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def apply(self, run: Run) -> Run:
+        columns = run.columns(self.channels, range(run.inputs, len(run.names)))
+        values = run.values[:, columns].copy()
+        values[1:][values[1:] == values[:-1]] = np.nan
+        return run.with_values(columns, values)
+
+
+@dataclass(frozen=True)
 class Fill:
     """Step that reconstructs gaps of at most `most` samples between measured ones.
 

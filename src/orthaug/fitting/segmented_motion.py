@@ -78,6 +78,8 @@ class SegmentedMotion(SegmentedProblem):
         features = problem.features[: bound.nz]  # none without a learner
         substeps = problem.substeps if like is None else like.dynamics.substeps
         dynamics = dynamics_of(problem.motion, features, bound, record.sampling_time, substeps)
+        if predictor is not None or sums is not None:
+            record.check_measured()
         dynamics = dynamics if predictor is None else predictor_of(dynamics)
         shares = 1 if sums is None else sums.engine.shares
         return cls(

@@ -46,6 +46,7 @@ _SUMMARIES = {
     "decimate": "keep each n-th row, filtered",
     "resample": "put onto an even grid",
     "outliers": "mark outliers (Hampel)",
+    "repeats": "mark repeated samples",
     "fill": "fill short gaps",
     "shift": "shift an input in time",
 }
