@@ -2,7 +2,9 @@
 
 Least squares one step ahead is biased by noise on the outputs, most where a system is slow beside
 its sampling. Instruments mend it (Young and Jakeman 1979): the outputs of the free run in place of
-the measured ones, with all rows filtered by 1/A of the model before.
+the measured ones, with all rows filtered by 1/A of the model before. That begins at least squares,
+and where light damping makes these useless, at the poles of a long model that is reduced (Kung
+1978).
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ from orthaug.data.sources import RecordSource, witness
 from orthaug.selection.orders import Orders, correlated_delay
 
 _MOST = 4  # lags of a channel
+_LONG = 40  # lags of a long model, whose poles orders begin at
+_RESPONSE = 200  # rows of its impulse response
+_PER_COLUMN = 5  # rows that one of its coefficients needs
 LOOKED_AT = 40_000
 """Rows of a longer record that orders are found on, in windows spread over it."""
 FITTED = 0.7  # share of the rows that a candidate is fitted to
@@ -38,6 +43,7 @@ _SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
 _TELLING = 0.7  # error over the output's deviation, from which on a free run ranks no orders
 _RESTARTED = (300, 100, 30, 10)  # rows after which a run is started again where longer ones do not
+_DOUBTFUL = 0.1  # of the output's deviation: above, refinement begins at other poles, too
 _DYNAMIC = 0.25  # of the error without past outputs, below which runs with them are believed
 
 _TOGETHER = 8_000  # rows that outputs with each other's past are looked at on
@@ -45,6 +51,7 @@ _COUPLED = 0.9  # of the error without it, below which the past of other outputs
 _ROUNDS = 3  # times that instruments refine a fit of all outputs
 
 Pair: TypeAlias = tuple[int, int]
+_Poles: TypeAlias = dict[int, Vector]
 _Choice: TypeAlias = tuple[float, Orders, tuple[float, ...]]
 """The least error of all orders, the smallest orders near it, and their error of each output."""
 
@@ -94,7 +101,17 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
         delays = tuple(None if delay is None else max(delay, 1) for delay in delays)
         first_lags = [tuple(max(lag, 1) for lag in lags) for lags in first_lags]
     first_lags = [*dict.fromkeys(first_lags)]
-    chosen, restarted = _telling(record, excited, first_lags, 0 if direct else 1)
+    given = (record, excited, first_lags, 0 if direct else 1)
+    chosen, restarted = _telling(*given, ())
+    if chosen is None or chosen[0] > _DOUBTFUL or restarted is not None:
+        poles = [_reduced_poles(record, j) for j in range(len(record.outputs))]
+        other, after = _telling(*given, poles) if all(poles) else (None, None)
+        if other is not None and (
+            chosen is None
+            or (after is None and restarted is not None)
+            or (after == restarted and other[0] * _BETTER < chosen[0])
+        ):
+            chosen, restarted = other, after
     if chosen is None:
         return None
     across, chosen = _coupled(record, excited, chosen, restarted)
@@ -263,17 +280,21 @@ def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
 
 
 def _telling(
-    record: Record, excited: tuple[int, ...], first_lags: Sequence[tuple[int, ...]], least: int
+    record: Record,
+    excited: tuple[int, ...],
+    first_lags: Sequence[tuple[int, ...]],
+    least: int,
+    poles: Sequence[_Poles],
 ) -> tuple[_Choice | None, int | None]:
     """Return the choice of the longest runs that follow the output, and after what they restart.
 
     One without past outputs may win among runs that drift: it stays where runs of 100 rows confirm
     it.
     """
-    whole = _best_choice(record, excited, first_lags, None, least)
+    whole = _best_choice(record, excited, first_lags, None, least, poles)
     if whole is None:  # under feedback none may be bounded
         for length in _RESTARTED if record.inputs else ():
-            tried = _best_choice(record, excited, first_lags, length, least)
+            tried = _best_choice(record, excited, first_lags, length, least, poles)
             if tried is not None:
                 return tried, length
     if whole is None or not record.inputs or (whole[0] < _TELLING and whole[1].na):
@@ -281,7 +302,7 @@ def _telling(
     static = whole[0] < _TELLING
     best: tuple[_Choice, int | None] = (whole, None)
     for length in _RESTARTED[:2] if static else _RESTARTED:
-        tried = _best_choice(record, excited, first_lags, length, least)
+        tried = _best_choice(record, excited, first_lags, length, least, poles)
         if tried is None:
             break
         if tried[0] < (_DYNAMIC * whole[0] if static else _TELLING):
@@ -297,18 +318,24 @@ def _best_choice(
     first_lags: Sequence[tuple[int, ...]],
     length: int | None,
     least: int,
+    poles: Sequence[_Poles],
 ) -> _Choice | None:
     """Return the smallest orders near the best, from the first lags that are clearly better."""
     chosen: _Choice | None = None
     for nk in first_lags:  # a test may miss them
-        found = _smallest(record, excited, nk, length, least)
+        found = _smallest(record, excited, nk, length, least, poles)
         if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
             chosen = found
     return chosen
 
 
 def _smallest(
-    record: Record, excited: tuple[int, ...], nk: tuple[int, ...], length: int | None, least_na: int
+    record: Record,
+    excited: tuple[int, ...],
+    nk: tuple[int, ...],
+    length: int | None,
+    least_na: int,
+    poles: Sequence[_Poles],
 ) -> _Choice | None:
     """Return the least error of all orders from these first lags on, and the smallest near it.
 
@@ -317,7 +344,7 @@ def _smallest(
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
     for na, n in product(range(least_na, _MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
-        errors = _errors(record, orders, length)
+        errors = _errors(record, orders, length, poles)
         if errors is not None and orders.size:
             tried.append((float(np.mean(errors)), orders.size, orders, errors))
     if not tried:
@@ -387,11 +414,57 @@ def _persistence(record: Record, number: int) -> int:
     return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
 
 
-def _errors(record: Record, orders: Orders, length: int | None) -> tuple[float, ...] | None:
+def _reduced_poles(record: Record, j: int) -> _Poles:
+    """Return denominators of a long model of an output, reduced to few states, by their number.
+
+    The model of many lags, which noise on the output hardly biases, has an impulse response. The
+    states of its Hankel matrix that hold most of it have the poles (Kung 1978). None are returned
+    for too few rows, or where the model is not stable.
+    """
+    nu = len(record.inputs)
+    rows = int(FITTED * sum(max(len(e) - _LONG, 0) for e in record.experiments))
+    rows = min(rows, _TOGETHER)
+    long = min(_LONG, rows // (_PER_COLUMN * (1 + nu)))
+    if not nu or long < 2 * _MOST:
+        return {}
+    orders = Orders(long, (long,) * nu, (1,) * nu)
+    usable = [e for e in record.experiments if len(e) > long + 1]
+    phi = np.concatenate([_rows(e, j, orders, long) for e in usable])[:rows]
+    y = np.concatenate([e.outputs[long:, j] for e in usable])[:rows]
+    scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    theta = np.linalg.lstsq(phi / scale, y, rcond=_RANK)[0] / scale
+    response = np.zeros((_RESPONSE, nu))
+    past, driven = theta[:long], theta[long:-1].reshape(nu, long)
+    for k in range(_RESPONSE):
+        before = response[max(k - long, 0) : k][::-1]
+        response[k] = past[: len(before)] @ before
+        response[k] += driven[:, k] if k < long else 0.0
+    if not np.isfinite(response).all() or np.abs(response).max() > 1 / _RANK:
+        return {}
+    half = _RESPONSE // 2
+    hankel = np.block([[response[i + k] for k in range(half)] for i in range(half)])
+    u, s, _ = np.linalg.svd(hankel, full_matrices=False)
+    found = {}
+    for n in range(1, _MOST + 1):
+        if s[n - 1] > _RANK * s[0]:
+            seen = u[:, :n] * np.sqrt(s[:n])
+            forward = np.linalg.lstsq(seen[:-1], seen[1:], rcond=None)[0]
+            taps = np.real(np.poly(np.linalg.eigvals(forward)))
+            if np.all(np.abs(np.roots(taps)) < 1):
+                found[n] = taps
+    return found
+
+
+def _errors(
+    record: Record, orders: Orders, length: int | None, poles: Sequence[_Poles] = ()
+) -> tuple[float, ...] | None:
     """Return the error of the free run on the last rows for each output.
 
     It starts again from measured lags after `length` rows. None where it cannot be fitted, or runs
     away.
+
+    Args:
+        poles: of each output, denominators by their degree at which refinement begins, too.
     """
     first = _first_row(orders)
     usable = [e for e in record.experiments if len(e) > first + 1]
@@ -411,7 +484,10 @@ def _errors(record: Record, orders: Orders, length: int | None) -> tuple[float, 
             return None
         simulated = phi / scale @ theta
         if record.inputs:
-            simulated = _best_free_run(usable, j, theta / scale, orders, first, cut)
+            starts = [theta / scale]
+            if poles and orders.na in poles[j]:
+                starts += _from_poles(usable, j, poles[j][orders.na], orders, first, cut)
+            simulated = _best_free_run(usable, j, starts, orders, first, cut)
         with np.errstate(all="ignore"):  # one that is not stable overflows
             wrong = float(np.sqrt(np.mean((simulated[cut:] - y[cut:]) ** 2)))
         if not np.isfinite(wrong):
@@ -420,24 +496,57 @@ def _errors(record: Record, orders: Orders, length: int | None) -> tuple[float, 
     return tuple(found)
 
 
+def _from_poles(
+    experiments: list[Experiment], j: int, taps: Vector, orders: Orders, first: int, cut: int
+) -> list[Vector]:
+    """Return θ with these poles, whose free run from rest follows the output best; none without."""
+    from scipy.signal import lfilter
+
+    driven = np.concatenate(
+        [
+            lfilter([1.0], taps, _rows(e, j, orders, first)[:, orders.na :], axis=0)
+            for e in experiments
+        ]
+    )[:cut]
+    y = np.concatenate([e.outputs[first:, j] for e in experiments])[:cut]
+    scale = np.maximum(np.linalg.norm(driven, axis=0), 1e-300)
+    if not np.isfinite(driven).all():
+        return []
+    b = np.linalg.lstsq(driven / scale, y, rcond=_RANK)[0] / scale
+    return [np.concatenate([-taps[1:], b])]
+
+
 def _best_free_run(
-    experiments: list[Experiment], j: int, theta: Vector, orders: Orders, first: int, cut: int
+    experiments: list[Experiment],
+    j: int,
+    starts: Sequence[Vector],
+    orders: Orders,
+    first: int,
+    cut: int,
 ) -> Vector:
-    """Return the free run that is best over the first `cut` rows, of least squares or refined."""
+    """Return the free run that is best over the first `cut` rows, of some starts or refined."""
     y = np.concatenate([e.outputs[first:, j] for e in experiments])
     best, least = np.full(len(y), np.inf), np.inf
-    for _ in range(1 + _REFINED):
-        runs = [_free_run(e, j, theta, orders, first) for e in experiments]
-        simulated = np.concatenate(runs)
-        with np.errstate(all="ignore"):
-            square = float(np.mean((simulated[:cut] - y[:cut]) ** 2))
-        if not square < least:
-            break
-        best, least = simulated, square
-        refined = _by_instruments(experiments, runs, j, theta, orders, first, cut)
-        if refined is None:
-            break
-        theta = refined
+    for theta in starts:
+        for refine in (_by_instruments, _by_descent):
+            own = np.inf
+            for _ in range(1 + _REFINED):
+                runs = [_free_run(e, j, theta, orders, first) for e in experiments]
+                simulated = np.concatenate(runs)
+                with np.errstate(all="ignore"):
+                    square = float(np.mean((simulated[:cut] - y[:cut]) ** 2))
+                if not square < own:
+                    break
+                own, reached = square, theta
+                if own < least:
+                    best, least = simulated, own
+                refined = refine(experiments, runs, j, theta, orders, first, cut)
+                if refined is None:
+                    break
+                theta = refined
+            if not np.isfinite(own):
+                break
+            theta = reached
     return best
 
 
@@ -454,22 +563,67 @@ def _by_instruments(
 
     None where A is not stable or the instruments do not determine θ.
     """
+    instruments = _filtered(experiments, j, theta, orders, first, runs)
+    if instruments is None:
+        return None
+    measured = _filtered(experiments, j, theta, orders, first)
+    assert measured is not None
+    return _solved(*(part[:cut] for part in (instruments[0], *measured)))
+
+
+def _by_descent(
+    experiments: list[Experiment],
+    runs: list[Vector],
+    j: int,
+    theta: Vector,
+    orders: Orders,
+    first: int,
+    cut: int,
+) -> Vector | None:
+    """Return θ after a step of Gauss and Newton on the errors of the free runs.
+
+    Their slopes are the rows of the run, filtered by 1/A. None as of `_by_instruments`.
+    """
+    slopes = _filtered(experiments, j, theta, orders, first, runs)
+    if slopes is None:
+        return None
+    left = np.concatenate([e.outputs[first:, j] for e in experiments]) - np.concatenate(runs)
+    step = _solved(slopes[0][:cut], slopes[0][:cut], left[:cut])
+    return None if step is None else theta + step
+
+
+def _filtered(
+    experiments: list[Experiment],
+    j: int,
+    theta: Vector,
+    orders: Orders,
+    first: int,
+    runs: list[Vector] | None = None,
+) -> tuple[Matrix, Vector] | None:
+    """Return rows and output filtered by 1/A, measured or of free runs.
+
+    None where A is unstable.
+    """
     from scipy.signal import lfilter
 
     taps = np.concatenate([[1.0], -theta[: orders.na]])
     if not orders.na or np.any(np.abs(np.roots(taps)) >= 1):
         return None
-    phi, z, y = [], [], []
-    for e, run in zip(experiments, runs, strict=True):
-        outputs = e.outputs.copy()
-        outputs[first:, j] = run
-        own, simulated = (_rows(one, j, orders, first) for one in (e, replace(e, outputs=outputs)))
-        phi.append(lfilter([1.0], taps, own, axis=0))
-        z.append(lfilter([1.0], taps, simulated, axis=0))
-        y.append(lfilter([1.0], taps, e.outputs[first:, j]))
-    own, instruments, target = (np.concatenate(one)[:cut] for one in (phi, z, y))
-    scale = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
-    system = (instruments / scale).T @ (own / scale)
+    rows, target = [], []
+    for i, e in enumerate(experiments):
+        if runs is not None:
+            outputs = e.outputs.copy()
+            outputs[first:, j] = runs[i]
+            e = replace(e, outputs=outputs)
+        rows.append(lfilter([1.0], taps, _rows(e, j, orders, first), axis=0))
+        target.append(lfilter([1.0], taps, e.outputs[first:, j]))
+    return np.concatenate(rows), np.concatenate(target)
+
+
+def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
+    """Return θ by instruments; None where they do not determine it."""
+    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    system = (instruments / scale).T @ (rows / scale)
     if not np.isfinite(system).all() or not np.linalg.cond(system) < 1 / _RANK:
         return None
     return np.linalg.solve(system, (instruments / scale).T @ target) / scale
