@@ -8,7 +8,7 @@ from pydantic import Field
 
 from orthaug._base.content import ByName, Content, Flag, Number, Numbers, Whole
 from orthaug._base.errors import Warning
-from orthaug.analysis.bias import ResidualStep
+from orthaug.analysis.bias import ResidualStep, place_of
 from orthaug.analysis.changes import Change
 from orthaug.analysis.imitation import Alternative
 from orthaug.analysis.input_timing import HoldTrial
@@ -141,9 +141,10 @@ class SuspectResult(Content):
 
 
 class MissingTermResult(Content):
-    """A term that an equation of a motion may lack."""
+    """A term that an equation of a motion may lack; `equation` is None of one of an `output`."""
 
-    equation: str
+    equation: str | None
+    output: str | None = None
     variable: str | None
     shape: str
     coefficient: Number
@@ -153,6 +154,11 @@ class MissingTermResult(Content):
     """The expression without its coefficient."""
     variables: list[str] = []
     """The states and inputs that it depends on."""
+
+    @property
+    def place(self) -> str:
+        """Where the term stands, in words."""
+        return place_of(self.equation, self.output)
 
 
 class MissingResult(Content):

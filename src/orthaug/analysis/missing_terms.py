@@ -14,7 +14,7 @@ does not pass for colour.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
+from orthaug.analysis.bias import place_of
 from orthaug.analysis.suspects import changes_sign
 from orthaug.analysis.term_sensitivities import Sensitivities, Terms, sensitivities
 from orthaug.fitting.motion_estimate import MotionEstimate
@@ -59,17 +60,19 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 # Of what the best simple term leaves: a term with the best of many widths is named first below it.
 # Saturations leave 0.2 to 0.6 of what a cube does, cubic springs 0.4 to 1 (missing_terms.py)
 _LESS = 0.6
+_ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
 
 @dataclass(frozen=True)
 class MissingTerm:
     """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
-    `coefficient` is in the units of equation and variable, `share` that of the errors' variance,
+    `equation` is None of a term of an output, which `output` names then. `coefficient` is in the
+    units of equation and variable, `share` that of the errors' variance,
     less what chance explains.
     """
 
-    equation: str
+    equation: str | None
     variable: str | None
     """None for a constant."""
     shape: str
@@ -85,6 +88,12 @@ class MissingTerm:
     """Of a variable that keeps its sign, such as a temperature, what the term counts from: it is
     the term's value there that is subtracted.
     """
+    output: str | None = None
+
+    @property
+    def place(self) -> str:
+        """Where the term stands, in words."""
+        return place_of(self.equation, self.output)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -128,11 +137,13 @@ class MissingTerm:
 
     def curves_like(self, other: MissingTerm) -> bool:
         """Return whether both count from a level of one variable: nearly straight there."""
-        same = (self.equation, self.variable) == (other.equation, other.variable)
+        same = (self.place, self.variable) == (other.place, other.variable)
         return same and self.reference is not None and other.reference is not None
 
     def __str__(self) -> str:
-        return f"the equation of {self.equation} lacks something {self.meaning}: {self.expression}"
+        meaning = self.meaning  # a sensor has no springs and no friction
+        meaning = meaning if self.equation is not None else meaning.partition(", as")[0]
+        return f"{self.place} lacks something {meaning}: {self.expression}"
 
 
 @dataclass(frozen=True)
@@ -230,11 +241,26 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     terms that begin beyond a size of one. None where the runs have no slopes, or there are too few
     rows.
     """
-    motion = fit.problem.motion
     if not fit.segmented.dynamics.differentiable:
         return None
-    equations = doubted_equations(fit)
-    rows = fit.segmented.segments.count * len(motion.outputs)
+    doubted, others = doubted_equations(fit)
+    found = _missing_in(fit, doubted)
+    if not others or found is None or (found.terms and found.terms[0].share > _ENOUGH):
+        return found
+    beyond = _missing_in(fit, others)  # a sensor may bend what it measures
+    if beyond is None or not beyond.terms:
+        return found
+    left = 1 - (found.terms[0].share if found.terms else 0.0)
+    if 1 - beyond.terms[0].share > _LESS * left:
+        return found
+    return replace(beyond, p=min(2 * beyond.p, 1.0))
+
+
+def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | None:
+    """Return the test of terms in some equations, numbered as by `doubted_equations`."""
+    motion = fit.problem.motion
+    names = (*motion.names_of_states, *(output.name for output in motion.outputs))
+    rows = int(fit.segmented.observations.sum())
     tried = _Tried(*_variables(motion), _products(motion.visible), _WIDTHS)
     for fewer in ({"products": []}, {"beyond": ()}):
         if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
@@ -269,12 +295,13 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         if not gains[j] > _RIVAL * gains.max():
             break
         place, number = divmod(int(j), tried.count)
-        equation = motion.names_of_states[equations[place]]
-        made = (equation, number, float(coefficients[j]), float(shares[j]))
+        made = (names[equations[place]], number, float(coefficients[j]), float(shares[j]))
         term = _term(tried, sizes[0], *made)
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
+        if equations[place] >= len(motion.states):
+            term = replace(term, equation=None, output=term.equation)
         if not any(term.curves_like(other) for _, other in named):
             named.append((place, term))
     listed = [term for _, term in named]
@@ -291,8 +318,8 @@ def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTer
 
     It has a width more than the others, and is named once.
     """
-    same = (best.equation, best.variable, BEYOND)
-    others = [one for one in listed if (one.equation, one.variable, one.shape) != same]
+    same = (best.place, best.variable, BEYOND)
+    others = [one for one in listed if (one.place, one.variable, one.shape) != same]
     if not others or 1 - best.share < _LESS * (1 - others[0].share):
         return [best, *(one for one in others if one.share > _RIVAL * best.share)]
     return [others[0], *([best] if best.share > others[0].share else []), *others[1:]]
@@ -319,8 +346,8 @@ def _finer(
         return None
     *_, gains, shares, coefficients, _ = tested
     j = int(np.argmax(gains))
-    made = (term.equation, one.simple + j, float(coefficients[j]), float(shares[j]))
-    best = _term(one, sizes[0], *made)
+    made = ("", one.simple + j, float(coefficients[j]), float(shares[j]))
+    best = replace(_term(one, sizes[0], *made), equation=term.equation, output=term.output)
     return best if best.share > term.share else None
 
 
@@ -346,26 +373,33 @@ def _products(names: tuple[str, ...]) -> list[Product]:
     return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
 
 
-def doubted_equations(fit: MotionEstimate) -> tuple[int, ...]:
-    """Return the equations with a parameter or a learner; others, such as ẋ = v, define a state.
+def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the equations with a parameter or a learner, and the other outputs.
 
-    All, if there is none.
+    Equations of outputs are counted behind those of states. Others of states, such as ẋ = v, define
+    a state. All states, if there is none with a parameter.
     """
     motion, segmented = fit.problem.motion, fit.segmented
     c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
     p = motion.coordinates.physical(c)
     x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
     every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
-    moved = set(motion.learned[0])
+    nx, ny = len(motion.states), len(motion.outputs)
+    moved = {*motion.learned[0], *(nx + j for j in motion.learned[1])}
+
+    def values(point: Vector, row: Vector, p: Vector) -> Vector:
+        rates = np.asarray(motion.rates(point, row, p, np))
+        return np.concatenate([rates, np.asarray(motion.observed(point, row, p, np))])
+
     with np.errstate(all="ignore"):
         for point, row in zip(x[every], u[every], strict=True):
-            here = np.asarray(motion.rates(point, row, p, np))
+            here = values(point, row, p)
             for i in range(len(p)):
                 there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
-                moved |= set(
-                    np.flatnonzero(np.asarray(motion.rates(point, row, there, np)) != here).tolist()
-                )
-    return tuple(sorted(moved)) or tuple(range(len(motion.states)))
+                moved |= set(np.flatnonzero(values(point, row, there) != here).tolist())
+    if not any(i < nx for i in moved):
+        moved |= set(range(nx))
+    return tuple(sorted(moved)), tuple(i for i in range(nx, nx + ny) if i not in moved)
 
 
 def _values(tried: _Tried, sizes: _Sizes, rows: Matrix) -> Any:

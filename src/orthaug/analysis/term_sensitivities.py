@@ -68,7 +68,7 @@ def sensitivities(
     """Return the sensitivities along the training segments; None where a value is not finite.
 
     Args:
-        equations: states whose equations the terms are added to.
+        equations: states whose equations the terms are added to, and outputs, counted behind them.
         terms: makes the terms, given the points (n, M) of the runs.
         count: of terms.
     """
@@ -157,11 +157,16 @@ def _propagate(
         a, c = to_next[:, k, :, :n0], to_output[:, k, :, :n0]
         columns[:, k] = c @ slope
         columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
+        for place, i in enumerate(equations):
+            if i >= n0:
+                columns[:, k, i - n0, own + place * q : own + (place + 1) * q] = added[:, :, k].T
         slope = a @ slope
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
         now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
         for place, i in enumerate(equations):
             to = slice(own + place * q, own + (place + 1) * q)
+            if i >= n0:
+                continue
             if form.motion.scheme.discrete:
                 slope[:, i, to] += now
                 continue

@@ -11,7 +11,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import join_words, percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.input_timing import LateInput
-from orthaug.analysis.missing_terms import MissingTest
+from orthaug.analysis.missing_terms import MissingTerm, MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.quantised_output import QuantisedOutput
 from orthaug.analysis.residuals import ResidualTest
@@ -493,7 +493,8 @@ def _name_terms(lacks: MissingTest) -> str:
     """Return the terms that are most likely missing, or the equations where many explain a part."""
     best, *others = lacks.terms
     if lacks.scattered:
-        equations = ", ".join(dict.fromkeys(term.equation for term in lacks.terms))
+        places = dict.fromkeys(term.place.removeprefix("the equation of ") for term in lacks.terms)
+        equations = ", ".join(places)
         return (
             f"Simple terms of states and inputs explain {percent(lacks.share)} of it together, and "
             f"no single one does: a force of another form is missing, most likely in the equation "
@@ -507,9 +508,13 @@ def _name_terms(lacks: MissingTest) -> str:
     if others:
         text += (
             ", as would "
-            f"{' or '.join(f'{term.expression} in that of {term.equation}' for term in others[:2])}"
+            f"{' or '.join(f'{term.expression} in {_that(term)}' for term in others[:2])}"
         )
     return f"{text}."
+
+
+def _that(term: MissingTerm) -> str:
+    return term.place.replace("the equation", "that", 1)
 
 
 def colour_sentence(fit: MotionEstimate) -> str:

@@ -20,7 +20,7 @@ from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.analysis.input_timing import is_stepped
-from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, declared_output
 from orthaug.commands.spec import spec_model
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
@@ -102,7 +102,8 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
         return
     for term in test.terms[:_TERMS]:
         words = "a constant" if term.variable is None else ""
-        yield from _term(job, term.term, term.equation, term.coefficient, words)
+        place = term.equation or term.output
+        yield from _term(job, term.term, place, term.coefficient, words)
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -224,12 +225,14 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
     if result.residuals.verdict != "unmodelled" or best.variable is None:
         return
     if job.spec.declared_learner() is None:
-        change = {
-            f"motion.states.{best.equation}.learned": True,
-            "learner": {"inputs": list(best.variables)},
-        }
+        if best.equation is None:
+            own = declared_output(job, str(best.output))
+            learned = {f"motion.outputs.{best.output}": own | {"learned": True}}
+        else:
+            learned = {f"motion.states.{best.equation}.learned": True}
+        change = {**learned, "learner": {"inputs": list(best.variables)}}
         seen = join_words(best.variables)
-        words = f"a learner that sees {seen} in the equation of {best.equation}"
+        words = f"a learner that sees {seen} in {best.place}"
         yield Proposal(words, change, learns=True)
         return
     now = job.spec.learner_inputs()

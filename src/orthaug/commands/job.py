@@ -536,6 +536,12 @@ def _toml(job: Job) -> str:
     return toml_of(job.declaration)
 
 
+def declared_output(job: Job, name: str) -> dict[str, Any]:
+    """Return the section of a motion's output: its expression, and whether it is learned."""
+    own = job.declaration["motion"]["outputs"][name]
+    return {"expression": own} if isinstance(own, str) else dict(own)
+
+
 def toml_of(declaration: Mapping[str, Any]) -> str:
     """Return the text of a spec that was read."""
     import tomlkit

@@ -12,7 +12,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
 from orthaug.analysis.suspects import MotionSuspect
-from orthaug.commands.job import Job, JobPhysics, Variant
+from orthaug.commands.job import Job, JobPhysics, Variant, declared_output
 from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record
@@ -99,7 +99,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     ) -> tuple[dict[str, Any], str] | None:
         """Return the change of a spec that adds a term of an equation, and where that is, in words.
 
-        None where the equation has the term already, or for a term of an output.
+        None where the equation has the term already.
         """
         from orthaug.physics.suspected_motion import equations_of, usual_places
 
@@ -109,6 +109,16 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         if place is None:
             places = usual_places(motion)
             place = equations_of(motion)[places[0]] if len(places) == 1 else None
+        if place in [output.name for output in motion.outputs]:
+            now = declared_output(job, str(place))
+            own = now["expression"]
+            if f"*{''.join(expression.split())}" in "".join(own.split()):
+                return None
+            change = {
+                f"motion.outputs.{place}": now | {"expression": f"{own} + {name}*({expression})"},
+                f"motion.parameters.{name}": {"initial": initial},
+            }
+            return change, f"in the equation of the output {place}"
         if place not in motion.names_of_states:
             return None
         key = motion.equation_key
