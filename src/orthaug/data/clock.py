@@ -133,7 +133,7 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     Args:
         near: where the channels are, as in `run.y`; a time beside them comes before others.
     """
-    rows = max(column.filled for column in columns)
+    rows = max((column.filled for column in columns), default=0)
     parent = _parent(near)
     clock, refused = Clock(), []
     for column in sorted(

@@ -70,6 +70,7 @@ def predicted_problem(problem: MotionProblem, engine: Engine, *, warm: bool) -> 
             "noise of innovations needs the rows in the memory of this process; take the engine "
             "memory, or white noise."
         )
+    problem.record.check_measured()
     if warm:
         raise InputError(
             "noise of innovations has no warm start; leave out `initial`, or take white noise."
