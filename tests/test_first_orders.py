@@ -72,6 +72,20 @@ def test_noise_on_the_output_of_a_slow_system_takes_no_further_lags(seed):
     assert model.free_run[0] < 0.03
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_light_damping_behind_noise(seed):
+    """Two resonances with poles near the unit circle: least squares loses them in the noise."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-5, 5, size=200), 15)
+    y = np.zeros(3000)
+    for radius, angle, gain in ((0.9987, 0.22, 1.0), (0.994, 0.6, 0.6)):
+        a = np.array([1, -2 * radius * np.cos(angle), radius**2])
+        y += gain * lfilter([0, a.sum() / 2, a.sum() / 2], a, u)
+    model = first_model(Record.from_arrays(u, y + 0.05 * y.std() * rng.normal(size=3000)))
+    assert model is not None and model.orders.na == 4 and model.restarted is None
+    assert model.free_run[0] < 0.5  # from a measured start, whose noise it remembers for long
+
+
 def room(seed: int, coupling: float, rows: int = 1500) -> Record:
     """Air and wall of a room, of which the wall is heated by the air alone."""
     rng = np.random.default_rng(seed)

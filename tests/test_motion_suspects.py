@@ -235,6 +235,41 @@ def test_suspects_that_the_motion_cannot_have_are_refused(alone: oa.MotionEstima
     ]
 
 
+@pytest.mark.parametrize("bend", [0.0, 0.25])
+def test_a_sensor_that_bends_what_it_measures_is_named(bend: float) -> None:
+    """The missing cube is in the output; without it the friction in the equation is found."""
+    rng, h = np.random.default_rng(3), 0.01
+    force = np.repeat(rng.uniform(-20, 20, 60), 25)
+    x, v, xs = 0.0, 0.0, []
+    for u in force:
+        xs.append(x)
+        for _ in range(5):
+            friction = 0.0 if bend else 1.5 * np.tanh(v / 0.02)
+            v += h / 5 * (u - 1.5 * v - 30 * x - friction)
+            x += h / 5 * v
+    measured = np.array(xs)
+    measured = measured + bend * measured**3 + 0.002 * rng.normal(size=len(xs))
+    record = oa.Record.from_arrays(u=force, y=measured, sampling_time=h)
+    spring = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - c*v - k*x)/m", start="derivative of y"),
+        ],
+        [oa.Output("y", "x")],
+        positive(m=1.2, c=1.0, k=25.0),
+        inputs=["u"],
+    )
+    found = oa.diagnose(oa.estimate(record, spring, learner=None, criterion=WHOLE))
+    best = found.missing.terms[0]
+    assert found.verdict == "unmodelled" and best.share > 0.6
+    if bend:
+        assert (best.equation, best.output, best.variable, best.shape) == (None, "y", "x", "cube")
+        assert best.coefficient == pytest.approx(bend, rel=0.3)
+        assert "the equation of the output y lacks something odd in x" in found.text
+    else:
+        assert (best.equation, best.output, best.variable) == ("v", None, "v")
+
+
 def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
     """A level and a pump that are always positive: a dead zone of the pump is a constant there, and no friction."""
     rng, level, rows = np.random.default_rng(5), 1.0, []
