@@ -434,3 +434,40 @@ def test_a_lag_that_a_delay_explains_nearly_as_well_leaves_both_open():
     sure = LateInput("u", 0.05, 2, 0.05, 2, 0.115, 0.178)
     assert not sure.alike and sure.warning.code == "dead_time"
     assert "hardly distinguish" not in sure.warning.text
+
+
+@pytest.mark.proof
+def test_disturbances_that_add_up_are_no_missing_physics():
+    """An unstable pendulum in a loop with process noise: its free run is far off, and it is right."""
+    rng, step = np.random.default_rng(4), 0.02
+    angle, rate, rows = 0.0, 0.0, []
+    reference = np.repeat(rng.uniform(-0.4, 0.4, 40), 30)
+    for target in reference:
+        seen = angle + 0.001 * rng.normal()
+        torque = 12.0 * (target - seen) - 2.5 * rate
+        rows.append((torque, seen))
+        rate += 0.02 * rng.normal()
+        for _ in range(4):
+            rate += step / 4 * (9 * np.sin(angle) + 2 * torque - 0.8 * rate)
+            angle += step / 4 * rate
+    torque, seen = np.array(rows).T
+    record = oa.Record.from_arrays(torque, seen, sampling_time=step, inputs=["tq"], outputs=["ang"])
+    pendulum = oa.Motion.from_equations(
+        [
+            oa.State("th", "w", start="ang"),
+            oa.State("w", "a*sin(th) + b*tq - d*w", start="derivative of ang"),
+        ],
+        [oa.Output("ang", "th")],
+        [
+            oa.PhysicalParameter(name, initial=value, min=0)
+            for name, value in (("a", 7.0), ("b", 1.5), ("d", 0.5))
+        ],
+        inputs=["tq"],
+        substeps=2,
+    )
+    fit = oa.estimate(record, pendulum, learner=None, noise="innovations")
+    found = fit.diagnose()
+    assert found.residuals.verdict == "white"
+    assert "unexplained" not in {warning.code for warning in found.warnings}
+    for row, true in zip(found.parameters, (9.0, 2.0, 0.8), strict=True):
+        assert abs(row.value - true) < 3.5 * row.std

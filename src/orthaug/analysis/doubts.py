@@ -63,6 +63,8 @@ def doubt(made: E) -> E:
         None,
     )
     unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
+    if test is not None and test.is_far and fit.model.coloured and not unmodelled:
+        test = None  # disturbances add up along a free run, which innovations do not show
     left = _static_share(result) if unmodelled else 0.0
     known = {warning.code for warning in result.warnings}
     warnings: list[Warning] = list(failed)
