@@ -119,3 +119,27 @@ def test_check_and_fit_name_it(tmp_path):
         "its data were probably recorded under feedback"
         in (tmp_path / "result" / "report.html").read_text()
     )
+
+
+@pytest.mark.parametrize("fed_back", [True, False])
+def test_a_thermostat_is_feedback_and_a_switched_input_is_none(fed_back):
+    rng = np.random.default_rng(5)
+    on, wall, room, rows, left = 1.0, 20.0, 19.0, [], 0
+    outside = 3 + 4 * np.sin(np.arange(3000) / 230)
+    for cold in outside:
+        seen = room + 0.03 * rng.normal()
+        if fed_back:
+            on = 1.0 if seen < 19.7 else 0.0 if seen > 20.3 else on
+        elif not left:
+            on, left = 1.0 - on, int(rng.integers(10, 60))
+        left -= 1
+        rows.append((on, cold, seen))
+        wall += 0.06 * (room + 25 * on - wall)
+        room += 0.02 * (wall - room) - 0.006 * (room - cold)
+    on, cold, seen = np.array(rows).T
+    record = Record.from_arrays(np.stack([on, cold], 1), seen, inputs=["on", "cold"])
+    found = feedback_in(record)
+    assert [one.name for one in found if one.name == "on"] == (["on"] if fed_back else [])
+    if fed_back:
+        (warning,) = closed_loop(record)
+        assert "on, which switches where y has nearly the same values" in warning.text

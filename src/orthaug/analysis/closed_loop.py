@@ -32,6 +32,11 @@ _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no 
 _RANK = 1e-10
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
+_SWITCHES = 8  # of an input of two levels, up and down each
+_UNEVEN = 0.1  # deviation over mean of the lengths between them
+# Of the distance of the values at which it switches up and down: their scatter, and how far the
+# output moves in the second half of a stretch
+_ALIKE, _MOVING = 0.15, 0.25
 _PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags explain
 
 
@@ -39,12 +44,14 @@ _PERIODIC = 0.9  # autocorrelation at a period, beyond what short lags explain
 class Feedback:
     """Feedback found on an input: past outputs predict a `share` of what its own past leaves.
 
-    `name` is the input, `p` the level of the test.
+    `name` is the input, `p` the level of the test. `switched_by` is an output at whose thresholds
+    the input switches between two levels; its share is then 1.
     """
 
     name: str
     share: float
     p: float
+    switched_by: str = ""
 
 
 def feedback_in(record: Record) -> tuple[Feedback, ...]:
@@ -59,7 +66,10 @@ def feedback_in(record: Record) -> tuple[Feedback, ...]:
     with one_blas_thread():
         for j, channel in enumerate(record.inputs):
             tested = _input_share(record, j)
-            if tested is not None and tested[1] < _LEVEL / len(record.inputs):
+            switched = _switched_by(record, j)
+            if switched:
+                found.append(Feedback(channel.name, 1.0, 0.0, switched))
+            elif tested is not None and tested[1] < _LEVEL / len(record.inputs):
                 found.append(Feedback(channel.name, *tested))
     return tuple(found)
 
@@ -101,7 +111,10 @@ def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
     if not found:
         return ()
     named = ", ".join(
-        f"{one.name} ({percent(one.share)} of what its own past leaves)" for one in found
+        f"{one.name} ({percent(one.share)} of what its own past leaves)"
+        if not one.switched_by
+        else f"{one.name}, which switches where {one.switched_by} has nearly the same values"
+        for one in found
     )
     outputs = ", ".join(channel.name for channel in record.outputs)
     text = (
@@ -126,6 +139,42 @@ def _source(found: tuple[Feedback, ...], record: Record) -> str:
         "a motor's current moves its speed). If it is the plant, there is no reference to "
         "record: make it an output with an equation of its own."
     )
+
+
+def _switched_by(record: Record, j: int) -> str:
+    """Return an output at whose thresholds an input switches between two levels; "" for none.
+
+    Its stretches are of unequal length, and end at nearly equal values of the output, which still
+    moves there: switched by a clock these values would scatter, unless the output had settled.
+    """
+    levels = np.unique(np.concatenate([e.inputs[:, j] for e in record.experiments]))
+    if len(levels) != 2:
+        return ""
+    for i, output in enumerate(record.outputs):
+        ends: dict[bool, list[Vector]] = {True: [], False: []}
+        lengths: dict[bool, list[Vector]] = {True: [], False: []}
+        half: dict[bool, list[Vector]] = {True: [], False: []}
+        for e in record.experiments:
+            at = np.flatnonzero(np.diff(e.inputs[:, j])) + 1
+            up = e.inputs[at, j] == levels[1]
+            for rises in (True, False):
+                ends[rises].append(e.outputs[at[up == rises], i])
+                lengths[rises].append(np.diff(at)[up[1:] == rises])
+                begin, end = at[:-1][up[1:] == rises], at[1:][up[1:] == rises]
+                middle = e.outputs[(begin + end) // 2, i]
+                half[rises].append(np.abs(e.outputs[end, i] - middle))
+        high, low = (np.concatenate(ends[rises]) for rises in (False, True))
+        uneven = [np.concatenate(lengths[rises]) for rises in (True, False)]
+        if min(len(high), len(low)) < _SWITCHES or all(
+            one.std() < _UNEVEN * one.mean() for one in uneven
+        ):
+            continue
+        between = abs(float(np.median(high) - np.median(low)))
+        scatter = max(float(np.median(np.abs(np.diff(one)))) for one in (high, low))
+        moved = min(float(np.median(np.concatenate(half[rises]))) for rises in (True, False))
+        if scatter < _ALIKE * between and moved > _MOVING * between:
+            return output.name
+    return ""
 
 
 def _input_share(record: Record, j: int) -> tuple[float, float] | None:

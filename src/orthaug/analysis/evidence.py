@@ -129,16 +129,19 @@ class Evidence:
         """Number of blocks of cross-validation: by default none beside held-out parts."""
         return (0 if self.held_out else DEFAULT_BLOCKS) if self.blocks is None else self.blocks
 
-    @property
-    def method(self) -> str:
-        """The method of estimation, as `closed_loop` names it."""
+    def method(self, criterion: Criterion | None = None) -> str:
+        """Return the method of estimation, as `closed_loop` names it.
+
+        Args:
+            criterion: that was chosen, by default the declared one.
+        """
         if not isinstance(self.problem, Problem):
             if noise_of_motion(self.noise) == "innovations":
                 return "noise"
             return "loop" if self.problem.motion.held else "motion"
         if self.noise != "white":
             return "noise"
-        return "direct" if self.criterion.free_run is None else "free run"
+        return "direct" if (criterion or self.criterion).free_run is None else "free run"
 
 
 def sample_warnings(problem: PosedProblem) -> list[Warning]:

@@ -143,7 +143,7 @@ def _analyse(
         )
         if fit.std is not None:  # the robust ones need no covariance of the weights
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
-        warnings += closed_loop(evidence.train.record, evidence.method)
+        warnings += closed_loop(evidence.train.record, evidence.method(fit.criterion))
         warnings += few_frequencies(evidence.train.record, len(fit.problem.names))
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")

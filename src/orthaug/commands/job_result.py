@@ -22,7 +22,7 @@ def check(job: Job) -> CheckResult:
     Nothing is stored.
     """
     found, warnings = job.physics.check(job)
-    looped = closed_loop(job.train.record, job.evidence.method)
+    looped = closed_loop(job.train.record, job.evidence.method())
     return CheckResult.model_validate(
         {
             "data": job.data,
