@@ -233,3 +233,26 @@ def test_init_uses_the_rows_of_a_slow_sensor(project):
     data = tomllib.loads(made.read_text(encoding="utf-8"))["data"]
     assert data["train"]["every"] == 4 and data["train"]["rows"][0] == 1
     assert run("fit", made, "--out", project / "o").code == 0
+
+
+def test_a_sensor_whose_range_ends_is_named_and_its_samples_are_marked():
+    u, y, _ = signals(rows=1000)
+    high = float(np.quantile(y, 0.85))
+    record = oa.Record.from_arrays(u, np.minimum(y, high), sampling_time=STEP)
+    (warning,) = [w for w in data_warnings(record) if w.code == "saturated_output"]
+    assert "on 15 % of the rows" in warning.text and f"`high` = {high:.6g}" in warning.text
+    assert not [
+        w
+        for w in data_warnings(oa.Record.from_arrays(u, np.round(y, 1), sampling_time=STEP))
+        if w.code == "saturated_output"
+    ]
+    _, cut = fitted(record)
+    marked = oa.prepare(record, oa.Limits(high=high), missing="keep")
+    assert marked.prepared[0].samples == 150
+    _, values = fitted(marked)
+    true = np.array([*TRUE.values()])
+    assert np.all(np.abs(values / true - 1) < 0.05) and np.abs(cut / true - 1).max() > 0.05
+    with pytest.raises(oa.InputError, match="neither `low` nor `high`"):
+        oa.Limits()
+    with pytest.raises(oa.InputError, match="`high`|high"):
+        oa.Limits(high=float("nan"))

@@ -24,6 +24,7 @@ from .data import Detrend as Detrend
 from .data import Experiment as Experiment
 from .data import Fill as Fill
 from .data import Lags as Lags
+from .data import Limits as Limits
 from .data import Outliers as Outliers
 from .data import Record as Record
 from .data import Repeats as Repeats

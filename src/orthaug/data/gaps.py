@@ -9,10 +9,13 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
+from orthaug._base.lines import percent
+from orthaug.data.columns import Column
 from orthaug.data.record import Experiment, Record, unbroken, without_gaps
 
 _REGULAR = 0.8  # of the rows that lie in every n-th
 _SHORTEST = 20  # rows of a stretch
+_SATURATED = 0.01  # of the rows, at an extreme value
 
 
 def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
@@ -65,6 +68,33 @@ def held_warnings(record: Record) -> list[Warning]:
             f"rows only: `every` = {n}, `rows` from {first} on."
         )
         found.append(Warning("held_output", text))
+    return found
+
+
+def saturation_warnings(record: Record) -> list[Warning]:
+    """Return a warning of each output that stays at its largest or smallest value for many rows."""
+    found = []
+    for j, output in enumerate(record.outputs):
+        values = record.measured[j]
+        limits = Column(output.name, output.name, output.unit, values).limits
+        ends = [(value, rows) for value, rows in limits if rows >= _SATURATED * len(values)]
+        if not ends:
+            continue
+        unit = f" {output.unit}" if output.unit else ""
+        named = " and ".join(
+            f"{value:.6g}{unit} on {percent(rows / len(values))}" for value, rows in ends
+        )
+        keys = ", ".join(
+            f"`{'high' if value == values.max() else 'low'}` = {value:.6g}" for value, _ in ends
+        )
+        text = (
+            f"{output.name} is {named} of the rows, its largest or smallest value: the range of "
+            "the sensor may end there. A model that follows these rows has wrong parameters. Mark "
+            f'them as missing (step = "limits" in [[data.prepare]], {keys}), with `missing` = '
+            '"keep" beside a [motion] and "skip" otherwise. If the plant itself ends there, '
+            "write that into the physics."
+        )
+        found.append(Warning("saturated_output", text))
     return found
 
 

@@ -18,6 +18,7 @@ from orthaug.data.steps import (
     Channels,
     Detrend,
     Fill,
+    Limits,
     Outliers,
     Repeats,
     Resample,
@@ -176,13 +177,14 @@ STEPS = Registry(
         "resample": Resample,
         "outliers": Outliers,
         "repeats": Repeats,
+        "limits": Limits,
         "fill": Fill,
         "shift": Shift,
     },
     reserved=("step",),
 )
 _FILTERS = ("lowpass", "highpass", "decimate")
-MENDING = ("outliers", "repeats", "fill")
+MENDING = ("outliers", "repeats", "limits", "fill")
 """Steps that leave good samples as they are."""
 SAMPLING = ("decimate", "resample")
 """Steps after which there are other instants."""

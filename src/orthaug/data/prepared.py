@@ -11,6 +11,7 @@ from orthaug._base.errors import InputError
 _DONE = {
     "outliers": "marked as missing",
     "repeats": "marked as missing",
+    "limits": "marked as missing",
     "fill": "reconstructed",
 }
 

@@ -30,7 +30,7 @@ from orthaug.data.record import (
     steps_between,
     unbroken,
 )
-from orthaug.data.steps import Fill, Outliers, Repeats, Resample, Run
+from orthaug.data.steps import Fill, Limits, Outliers, Repeats, Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -193,7 +193,7 @@ class _RawRanges:
         """Return the record after the steps."""
         check_steps(steps)
         mends = self.missing != "error" or any(
-            isinstance(step, Outliers | Repeats | Fill) for step in steps
+            isinstance(step, Outliers | Repeats | Limits | Fill) for step in steps
         )
         uneven = any(isinstance(step, Resample) for step in steps)
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]

@@ -291,6 +291,45 @@ class Repeats:
 
 
 @dataclass(frozen=True)
+class Limits:
+    """Step that marks samples at the end of a sensor's range, and beyond, as missing.
+
+    Args:
+        low: samples at most as large are missing; None for none.
+        high: samples at least as large are missing.
+        channels: names; None for the outputs.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=[0.0] * 4, y=[1.0, 8.0, 10.0, 10.0])
+        >>> prepare(record, Limits(high=10.0), missing="keep").experiments[0].outputs.ravel()
+        array([ 1.,  8., nan, nan])
+    """
+
+    low: float | None = None
+    high: float | None = None
+    channels: Channels = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        for name in ("low", "high"):
+            if getattr(self, name) is not None:
+                check_number(getattr(self, name), name)
+        if self.low is None and self.high is None:
+            raise InputError("`limits` has neither `low` nor `high`; give one of them.")
+
+    def apply(self, run: Run) -> Run:
+        columns = run.columns(self.channels, range(run.inputs, len(run.names)))
+        values = run.values[:, columns].copy()
+        with np.errstate(invalid="ignore"):
+            beyond = np.zeros(values.shape, dtype=bool)
+            beyond |= False if self.low is None else values <= self.low
+            beyond |= False if self.high is None else values >= self.high
+        values[beyond] = np.nan
+        return run.with_values(columns, values)
+
+
+@dataclass(frozen=True)
 class Fill:
     """Step that reconstructs gaps of at most `most` samples between measured ones.
 

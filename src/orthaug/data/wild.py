@@ -17,7 +17,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
 from orthaug.data.columns import quantum_of
-from orthaug.data.gaps import complete_record, filled_record, held_warnings
+from orthaug.data.gaps import complete_record, filled_record, held_warnings, saturation_warnings
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -160,7 +160,7 @@ def data_warnings(
     if complete is None:
         return found
     found += _repeat_warnings(complete) or held_warnings(complete)
-    return [*found, *_frozen_warnings(complete)]
+    return [*found, *_frozen_warnings(complete), *saturation_warnings(complete)]
 
 
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:

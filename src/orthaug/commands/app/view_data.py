@@ -47,6 +47,7 @@ _SUMMARIES = {
     "resample": "put onto an even grid",
     "outliers": "mark outliers (Hampel)",
     "repeats": "mark repeated samples",
+    "limits": "mark samples at a limit",
     "fill": "fill short gaps",
     "shift": "shift an input in time",
 }
