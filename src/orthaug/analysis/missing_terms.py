@@ -60,6 +60,7 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 # Of what the best simple term leaves: a term with the best of many widths is named first below it.
 # Saturations leave 0.2 to 0.6 of what a cube does, cubic springs 0.4 to 1 (missing_terms.py)
 _LESS = 0.6
+_CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
 
@@ -248,12 +249,24 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     if not others or found is None or (found.terms and found.terms[0].share > _ENOUGH):
         return found
     beyond = _missing_in(fit, others)  # a sensor may bend what it measures
-    if beyond is None or not beyond.terms:
+    if beyond is None or not beyond.terms or _is_a_shift(beyond.terms[0], fit.problem.motion):
         return found
     left = 1 - (found.terms[0].share if found.terms else 0.0)
     if 1 - beyond.terms[0].share > _LESS * left:
         return found
     return replace(beyond, p=min(2 * beyond.p, 1.0))
+
+
+def _is_a_shift(term: MissingTerm, motion: Motion) -> bool:
+    """Return whether a term of an output is what a shift in time, or another hold, makes of it.
+
+    The slope of a state times the shift is linear in states; and an input that is not held as the
+    motion says acts a little at once.
+    """
+    if term.shape != "linear":
+        return False
+    only_states = set(term.variables) <= set(motion.names_of_states)
+    return only_states or term.share < _CERTAIN
 
 
 def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | None:

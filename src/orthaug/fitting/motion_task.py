@@ -48,7 +48,7 @@ _LONGER = 8
 _POOR = 0.5  # of the output's deviation: what is left above it may not be the best minimum
 _SHORT_ITERATIONS = 15  # over segments that are not the last
 # Steps at most by which starts follow the outputs: a descent damps no step of theirs
-_SETTLING = 200
+_SETTLING = 25
 _STARTS = 8  # drawn, where the declared initial values lead nowhere
 _WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
 _CHEAP = 1_000_000  # operations of a pass over the record's equations
