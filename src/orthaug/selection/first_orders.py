@@ -101,11 +101,14 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
         delays = tuple(None if delay is None else max(delay, 1) for delay in delays)
         first_lags = [tuple(max(lag, 1) for lag in lags) for lags in first_lags]
     first_lags = [*dict.fromkeys(first_lags)]
-    given = (record, excited, first_lags, 0 if direct else 1)
-    chosen, restarted = _telling(*given, ())
+    least = 0 if direct else 1
+    chosen, restarted = _telling(record, excited, first_lags, least, ())
     if chosen is None or chosen[0] > _DOUBTFUL or restarted is not None:
-        poles = [_reduced_poles(record, j) for j in range(len(record.outputs))]
-        other, after = _telling(*given, poles) if all(poles) else (None, None)
+        few = witness(RecordSource(record, 0), _TOGETHER) if len(record) > _TOGETHER else record
+        poles = [_reduced_poles(few, j) for j in range(len(record.outputs))]
+        other, after = None, None
+        if all(poles):
+            other, after = _telling(few, excited, first_lags, least, poles)
         if other is not None and (
             chosen is None
             or (after is None and restarted is not None)
@@ -528,7 +531,7 @@ def _best_free_run(
     y = np.concatenate([e.outputs[first:, j] for e in experiments])
     best, least = np.full(len(y), np.inf), np.inf
     for theta in starts:
-        for refine in (_by_instruments, _by_descent):
+        for refine in (_by_instruments, _by_descent)[: len(starts)]:
             own = np.inf
             for _ in range(1 + _REFINED):
                 runs = [_free_run(e, j, theta, orders, first) for e in experiments]
