@@ -382,6 +382,24 @@ def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
     )
 
 
+def test_units_in_the_row_under_the_header(tmp_path):
+    u, y = plant()
+    rows = "".join(f"{10 * k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True)))
+    (tmp_path / "run.csv").write_text(f"Zeit,valve,flow\nms,%,l/s\n{rows}", encoding="utf-8")
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--out", spec, "--inputs", "valve", "--outputs", "flow"
+    )
+    told = unfolded(done.out)
+    assert f"{len(u)} rows, 3 columns; units are in the row under the header" in told
+    assert "sampling time: 0.01 s, from column 'Zeit'" in told
+    data = tomllib.loads(spec.read_text(encoding="utf-8"))["data"]
+    assert data["channels"] == {"valve": {"unit": "%"}, "flow": {"unit": "l/s"}}
+    assert data["time"] == "Zeit"
+    job = load_spec(spec)
+    assert job.train.record.sampling_time == pytest.approx(0.01)
+
+
 def test_dates_are_the_clock(tmp_path):
     u, y = plant(300)
     frame = pd.DataFrame(

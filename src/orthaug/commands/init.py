@@ -392,10 +392,10 @@ def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: floa
         raise InputError(
             f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}."
         )
-    if refused is not None and (kind == "output" or is_time(column.header)):
+    if refused is not None and (kind == "output" or is_time(column.titled)):
         raise InputError(
             f"{place} {refused.reason}; it is no "
-            f"{'channel' if is_time(column.header) else 'output'}."
+            f"{'channel' if is_time(column.titled) else 'output'}."
         )
 
 

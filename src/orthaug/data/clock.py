@@ -12,9 +12,9 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.data.columns import Column
-from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time
+from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time, with_unit
 from orthaug.data.record import same_step
-from orthaug.data.tables import column_names, read_table
+from orthaug.data.tables import read_table, read_titles
 from orthaug.data.variables import ENDINGS, scalars
 
 # Largest deviation of a step from the usual one, relative: one lost sample deviates by 1 or ½.
@@ -96,7 +96,7 @@ class Clock:
         Otherwise only its values do.
         """
         return self.column is not None and (
-            not self.instants or bool(self.column.unusable) or is_time(self.column.header)
+            not self.instants or bool(self.column.unusable) or is_time(self.column.titled)
         )
 
     def __str__(self) -> str:
@@ -109,7 +109,9 @@ class Clock:
         if not self.by_name:
             known = ", which rises as time does"
             known += (
-                "" if split_header(header)[1] else " and whose header has no unit; s is assumed"
+                ""
+                if split_header(self.column.titled)[1]
+                else " and whose header has no unit; s is assumed"
             )
         if not self.even:
             text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
@@ -137,33 +139,33 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     parent = _parent(near)
     clock, refused = Clock(), []
     for column in sorted(
-        columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)
+        columns, key=lambda c: (not is_time(c.titled), bool(near) and _parent(c.header) != parent)
     ):
         values, dates = column.finite, column.unusable == DATES
         if column.unusable and not dates:
             continue
-        step = step_of(column.header, float(values[0])) if column.constant else None
+        step = step_of(column.titled, float(values[0])) if column.constant else None
         if step is not None and clock.column is None:
             clock = Clock(step, column)
-        if not (dates or is_time(column.header)):
+        if not (dates or is_time(column.titled)):
             continue
         fault = _fault(column, rows)
         if fault is not None and not column.constant:
             refused.append(fault)
         elif fault is None and clock.column is None:
             clock = _column_clock(
-                column, column.values if dates else in_seconds(column.values, column.header)
+                column, column.values if dates else in_seconds(column.values, column.titled)
             )
         elif fault is None and not dates:
             refused.append(
                 RefusedColumn(column, "rises as a time does, and another column is the time", False)
             )
     for column in columns:
-        if column.unusable or column is clock.column or is_time(column.header):
+        if column.unusable or column is clock.column or is_time(column.titled):
             continue
         verdict = _resemblance(column)
         if verdict is None and clock.column is None and column.filled == rows:
-            clock = _column_clock(column, in_seconds(column.values, column.header))
+            clock = _column_clock(column, in_seconds(column.values, column.titled))
         elif verdict is None:
             refused.append(
                 RefusedColumn(
@@ -174,10 +176,10 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
             refused.append(verdict)
     faulty = next((one for one in refused if one.fault), None)
     if clock.step is None and faulty is not None:
-        steps = np.diff(in_seconds(faulty.column.finite, faulty.column.header))
+        steps = np.diff(in_seconds(faulty.column.finite, faulty.column.titled))
         clock = Clock(float(f"{np.median(steps[steps > 0]):.6g}"))
     kept = tuple(
-        one for one in refused if not clock.instants or not one.signal or is_time(one.column.header)
+        one for one in refused if not clock.instants or not one.signal or is_time(one.column.titled)
     )
     return replace(clock, refused=kept)
 
@@ -224,7 +226,7 @@ def _resemblance(column: Column) -> RefusedColumn | bool | None:
     steps = np.diff(values) / np.diff(rows)
     if len(steps) < _FEWEST - 1 or not (steps > 0).all():
         return False
-    header, usual = column.header, float(np.median(steps))
+    header, usual = column.titled, float(np.median(steps))
     line = np.interp(rows, rows[[0, -1]], values[[0, -1]])
     on_line = bool(np.abs(values - line).max() < 0.5 * steps.mean())
     thirds = [float(np.median(part)) for part in np.array_split(steps, 3)]
@@ -256,21 +258,23 @@ def read_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         apart: columns that are channels, whatever they are called.
         by_content: look at columns of any name.
     """
-    wanted = [name for name in column_names(path) if name not in apart]
-    wanted = [name for name in wanted if by_content or is_time(name) or step_of(name, 1.0)]
+    titles = read_titles(path)
+    titled = {n: with_unit(n, titles.units.get(n, "")) for n in titles.names if n not in apart}
+    wanted = [n for n, t in titled.items() if by_content or is_time(t) or step_of(t, 1.0)]
     columns, values = [], {}
     if by_content and wanted:
         with suppress(InputError):  # one of them holds no numbers: each by itself
-            values = read_table(path, list(dict.fromkeys(wanted)), most=_HEAD).columns
+            values = read_table(path, wanted, most=_HEAD).columns
     for header in wanted:
         with suppress(InputError):
-            named = header if is_time(header) else None  # it comes in s, as dates do
+            named = header if is_time(titled[header]) else None  # it comes in s, as dates do
             if named or header not in values:
                 values = {
                     **values,
                     header: read_table(path, [header], named, most=_HEAD).columns[header],
                 }
-            columns.append(Column(header, header, "", values[header], DATES if named else ""))
+            unit = titles.units.get(header, "")
+            columns.append(Column(header, header, unit, values[header], DATES if named else ""))
     clock = find_clock(columns) if columns else Clock()
     return clock if clock.column else by_single_number(path)
 

@@ -66,6 +66,11 @@ def split_header(header: str) -> tuple[str, str]:
     return header, ""
 
 
+def with_unit(header: str, unit: str) -> str:
+    """Return a header with the unit that is elsewhere, as under it; one of its own stays."""
+    return f"{header} [{unit}]" if unit and not split_header(header)[1] else header
+
+
 def last_part(name: str) -> str:
     """Return the name of a variable without the struct or group that it is in: `u` of `data.u`."""
     return re.split(r"[./]", name)[-1]

@@ -15,7 +15,7 @@ from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, fi
 from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
 from orthaug.data.layouts import numbers_only
-from orthaug.data.tables import column_names, read_table, reading_note
+from orthaug.data.tables import read_table, read_titles, reading_note
 from orthaug.data.variables import ENDINGS
 
 _MOST_EXPERIMENTS = 50  # that a column of the file may number
@@ -177,7 +177,7 @@ def survey(path: Path) -> Survey:
             numbers.
     """
     columns: list[Column] = []
-    every = list(column_names(path))
+    every, units = read_titles(path)
     if numbers_only(every):
         raise InputError(
             f"{path}: the first line holds numbers; a header with names is expected there. "
@@ -191,6 +191,7 @@ def survey(path: Path) -> Survey:
         refused = error
     for header in headers:
         base, unit = split_header(header)
+        unit = unit or units.get(header, "")
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
             unusable = "" if np.isfinite(values).any() else "no numbers"
@@ -213,7 +214,8 @@ def survey(path: Path) -> Survey:
     clock = find_clock(columns)
     if clock.column is None and clock.step is None:
         clock = replace(by_single_number(path), refused=clock.refused)
-    return Survey(path, tuple(columns), clock, reading_note(path))
+    notes = [reading_note(path), "units are in the row under the header" if units else ""]
+    return Survey(path, tuple(columns), clock, "; ".join(filter(None, notes)))
 
 
 def _as_dates(path: Path, header: str) -> tuple[Vector, str]:
