@@ -382,6 +382,44 @@ def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
     )
 
 
+def batches(path, header: str = "") -> None:
+    """Ten batches of a slow first-order system, each from cold, with its own time."""
+    rng, rows = np.random.default_rng(5), []
+    for batch in range(1, 11):
+        x = 15.0
+        for k in range(90):
+            u = rng.uniform(20, 80) if k % 15 == 0 else u
+            x = 0.97 * x + 0.03 * u
+            rows.append((batch, 30 * k, u, x + 0.05 * rng.normal()))
+    frame = pd.DataFrame(rows, columns=["Batch", header or "t", "valve", "temp"])
+    (frame if header else frame.drop(columns="t")).to_csv(path, index=False)
+
+
+def test_the_error_of_the_first_physics_is_of_runs_within_experiments(tmp_path):
+    batches(tmp_path / "run.csv")
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
+    )
+    told = unfolded(done.out)
+    assert "Batch numbers 10 experiments" in told
+    error = re.search(r"error in free run is ([\d.]+) %", told)
+    assert error is not None and float(error[1]) < 5
+
+
+@pytest.mark.parametrize("header", ["time [s]", "Time in batch [s]", "Zeit seit Beginn [s]"])
+def test_a_time_that_begins_anew_gives_the_step_and_is_not_listed_as_left_out(tmp_path, header):
+    batches(tmp_path / "run.csv", header)
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
+    )
+    told = unfolded(done.out)
+    assert f"30 s is usual in column '{header}', which begins anew with each experiment" in told
+    assert "left out" not in told
+    assert load_spec(spec).train.record.sampling_time == 30
+
+
 def test_units_in_the_row_under_the_header(tmp_path):
     u, y = plant()
     rows = "".join(f"{10 * k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True)))
@@ -644,7 +682,7 @@ NO_TIMES = {
     "a time that begins anew": (
         "time",
         EVEN % 4.0,
-        "falls from 3.98 to 0 in row 200, so it is not the time",
+        "0.02 s is usual in column 'time', which begins anew with each experiment",
     ),
     "instants that repeat": (
         "time",

@@ -70,6 +70,16 @@ class Clock:
         return self.seconds is not None
 
     @property
+    def faulty(self) -> Column | None:
+        """The column named as the time that has a fault, where the step is that of most its rows.
+
+        None where the step is from elsewhere.
+        """
+        if self.step is None or self.column is not None:
+            return None
+        return next((one.column for one in self.refused if one.fault), None)
+
+    @property
     def restarts(self) -> tuple[int, ...]:
         """Rows at which a column named as the time begins anew: those of further experiments."""
         for one in self.refused:
@@ -104,7 +114,8 @@ class Clock:
             return "no column states it"
         if self.column is None:
             one = next(one for one in self.refused if one.fault)
-            return f"{self.step:g} s is usual in column '{one.column.header}', which {one.fault}"
+            fault = "begins anew with each experiment" if self.restarts else one.fault
+            return f"{self.step:g} s is usual in column '{one.column.header}', which {fault}"
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
