@@ -420,6 +420,19 @@ def test_a_time_that_begins_anew_gives_the_step_and_is_not_listed_as_left_out(tm
     assert load_spec(spec).train.record.sampling_time == 30
 
 
+def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
+    u, y = plant(100)
+    words = np.where(u > 0, "ON", "OFF")
+    pd.DataFrame({"pump": words, "flow": y}).to_csv(tmp_path / "run.csv", index=False)
+    options = ["--inputs", "pump", "--outputs", "flow", "--out", tmp_path / "spec.toml"]
+    done = run("init", tmp_path / "run.csv", *options)
+    assert done.code == 2
+    assert "no numbers. Its cells hold OFF and ON: write 0 and 1 for them" in unfolded(done.err)
+    done = run("init", tmp_path / "run.csv", "run2.csv", "run3.csv", *options)
+    assert done.code == 2 and "'run2.csv, run3.csv' besides" in done.err
+    assert "add the others to `files` of `train`" in unfolded(done.err)
+
+
 def test_units_in_the_row_under_the_header(tmp_path):
     u, y = plant()
     rows = "".join(f"{10 * k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True)))
@@ -684,9 +697,14 @@ NO_TIMES = {
         EVEN % 4.0,
         "0.02 s is usual in column 'time', which begins anew with each experiment",
     ),
+    "minutes that are each in six rows": (
+        "time",
+        np.arange(300) // 6 * 0.12,
+        "0.02 s, because column 'time' has each instant in 6 rows",
+    ),
     "instants that repeat": (
         "time",
-        np.floor(EVEN * 10),
+        np.floor((EVEN * 10) ** 1.3),
         "stays at 0 in row 1, so it is not the time",
     ),
     "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
@@ -707,7 +725,8 @@ def test_why_a_column_is_not_the_time_is_said(request, tmp_path, header, values,
         "--out",
         tmp_path / "spec.toml",
     )
-    known = "0.02 s is usual" if "begins" in request.node.name else "no column states it"
+    known = "0.02 s, because" if "six rows" in request.node.name else "no column states it"
+    known = "0.02 s is usual" if "begins" in request.node.name else known
     assert done.code == 0 and f"sampling time: {known}" in done.out, done.err
     told = done.out.replace("\n  ", " ").splitlines()  # folded lines go on indented
     assert any(header in line and reason in line for line in told), done.out

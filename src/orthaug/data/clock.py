@@ -114,6 +114,9 @@ class Clock:
             return "no column states it"
         if self.column is None:
             one = next(one for one in self.refused if one.fault)
+            if (held := _rows_of_each(one.column.finite)) > 1:
+                named = f"column '{one.column.header}'"
+                return f"{self.step:g} s, because {named} has each instant in {held} rows"
             fault = "begins anew with each experiment" if self.restarts else one.fault
             return f"{self.step:g} s is usual in column '{one.column.header}', which {fault}"
         header, known = self.column.header, ""
@@ -188,7 +191,8 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     faulty = next((one for one in refused if one.fault), None)
     if clock.step is None and faulty is not None:
         steps = np.diff(in_seconds(faulty.column.finite, faulty.column.titled))
-        clock = Clock(float(f"{np.median(steps[steps > 0]):.6g}"))
+        step = np.median(steps[steps > 0]) / _rows_of_each(faulty.column.finite)
+        clock = Clock(float(f"{step:.6g}"))
     kept = tuple(
         one for one in refused if not clock.instants or not one.signal or is_time(one.column.titled)
     )
@@ -217,6 +221,10 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
         )
     if len(steps) and not ((steps > 0).mean() >= _RISES or (steps >= 0).all()):
         return RefusedColumn(column, "falls in many rows, so it is taken for a signal", True)
+    held = _rows_of_each(values)
+    if held > 1:
+        fault = f"has each instant in {held} rows"
+        return RefusedColumn(column, f"{fault}, so it is not the time", False, fault)
     at = int(np.flatnonzero(steps <= 0)[0]) + 1 if len(steps) else 0
     row = int(np.flatnonzero(np.isfinite(column.values))[at])
     went = f"stays at {values[at]:g}"
@@ -224,6 +232,20 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
     fault = f"{went} in row {row}" if len(steps) and (steps > 0).mean() >= _RISES else ""
     return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False, fault)
+
+
+def _rows_of_each(values: Vector) -> int:
+    """Return in how many rows each instant is, as where seconds are left out; 1 where they vary."""
+    steps = np.diff(values)
+    begins = np.flatnonzero(steps > 0) + 1
+    rows = np.diff(begins)  # of the first and the last instant there may be fewer
+    if len(rows) < _FEWEST or (steps < 0).any():
+        return 1
+    usual, moved = int(np.median(rows)), steps[begins - 1]
+    alike = (rows == usual).mean() >= _MOSTLY and np.isclose(
+        moved, np.median(moved)
+    ).mean() >= _MOSTLY
+    return usual if alike and max(begins[0], len(values) - begins[-1]) <= usual else 1
 
 
 def _resemblance(column: Column) -> RefusedColumn | bool | None:

@@ -31,6 +31,11 @@ MISSING = ("", "nan", "na", "n/a", "#n/a", "n.a.", "n.v.", "null", "none", "-", 
 _NO_UNIT = ("", "-", "--")  # cells of a row of units without one
 _LONGEST_UNIT = 12  # letters
 _BELOW = 5  # rows under the units that show which columns hold numbers
+STATES = frozenset(
+    ("on", "off", "true", "false", "yes", "no", "open", "closed", "ein", "aus", "auf", "zu")
+    + ("ja", "nein", "start", "stop", "high", "low")
+)
+"""Words of a state, in small letters, for which numbers can be written."""
 _BLANK = " "  # the separator that means any run of spaces and tabs
 _SEPARATORS = ("\t", ";", ",", _BLANK)
 _WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
