@@ -206,9 +206,9 @@ def continued(rows: Sequence[Sequence[str]], indent: int = 0) -> list[list[str]]
     Columns that are narrower than an equal share keep their width, and the others share the rest.
 
     Examples:
-        >>> with narrow_screen(40):
-        ...     continued([["seen", "determined"], ["u, v", "a, b, c, d, e, f, g, h, i, j, k, l"]])
-        [['seen', 'determined'], ['u, v', 'a, b, c, d, e, f, g, h, i, j, k,'], ['', 'l']]
+        >>> with narrow_screen(20):
+        ...     continued([["seen", "determined"], ["u, v", "a, b, c, d, e, f"]])
+        [['seen', 'determined'], ['u, v', 'a, b, c, d, e,'], ['', 'f']]
     """
     widths = _widths(rows)
     left = _screen[0] - indent - len(_GAP) * (len(widths) - 1)
