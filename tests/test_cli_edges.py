@@ -366,6 +366,29 @@ def test_columns_of_matrices(project, column):
     assert "run.npz" in message and ("counted from 0" in message or "no variable" in message)
 
 
+def test_a_table_of_many_lags_fits_the_screen(tmp_path):
+    rng = np.random.default_rng(1)
+    inputs = [f"valve_{j}" for j in range(3)]
+    columns = {name: rng.normal(size=300) for name in [*inputs, "y"]}
+    pd.DataFrame(columns).to_csv(tmp_path / "run.csv", index=False)
+    lags = [f"{name}[k-{i}]" for name in ["y", *inputs] for i in range(1, 5)]
+    terms = [
+        f'[[baseline.terms]]\nparameter = "p{n}"\nregressor = "{lag}"' for n, lag in enumerate(lags)
+    ]
+    data = f'inputs = {json.dumps(inputs)}\noutputs = ["y"]\ntrain.files = ["run.csv"]'
+    learner = '[learner]\nkind = "mlp"\nhidden = [4]'
+    text = "\n".join(["[data]", "sampling_time = 1", data, *terms, learner])
+    (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
+    shown = run("check", tmp_path / "spec.toml").out.splitlines()
+    assert max(map(len, shown)) <= 100
+    begin = next(i for i, line in enumerate(shown) if "with learner.inputs" in line)
+    end = shown.index("", begin)
+    for head, listed in (("with learner.inputs", lags[4:]), ("determined beside it", ["p4", "p5"])):
+        at = shown[begin].index(head)
+        cells = [line[at : at + 30].split("  ")[0].strip() for line in shown[begin + 1 : end]]
+        assert ", ".join(listed) in " ".join(cells)
+
+
 @pytest.mark.parametrize(
     "text", ["[" * 100_000, "[" * 100_000 + "]" * 100_000, '{"a":' * 100_000 + "1" + "}" * 100_000]
 )

@@ -219,6 +219,24 @@ def test_a_disturbance_with_memory_is_told_from_missing_physics():
         assert row.ci95[0] < true < row.ci95[1]
 
 
+@pytest.mark.parametrize("iterations", [1, 100])
+@pytest.mark.parametrize("physics", ["complete", "lacking"])
+def test_what_intervals_count_is_told_only_where_there_are_some(iterations, physics):
+    rng, noise = np.random.default_rng(5), np.zeros(1500)
+    for k in range(1, 1500):
+        noise[k] = 0.8 * noise[k - 1] + 0.05 * rng.normal()
+    how = {"criterion": oa.Simulation(), "solver": oa.LevenbergMarquardt(iterations=iterations)}
+    if physics == "complete":
+        found = second_order(noise, **how)
+    else:
+        terms = oa.Baseline.from_terms(PHYSICS)
+        found = oa.estimate(tanh_friction(), terms, learner=None, **how).diagnose()
+    text = dict((w.code, w.text) for w in found.warnings)["unexplained"]
+    given = any(row.ci95 is not None for row in found.parameters)
+    assert given == (iterations == 100)
+    assert ("The 95 % intervals count noise only" in text) == given
+
+
 @pytest.mark.parametrize("slope", [0.0, 1.0])
 def test_a_drift_is_named(slope):
     rng = np.random.default_rng(6)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from test_cli import run
 
 import orthaug as oa
@@ -87,6 +88,28 @@ def test_a_learner_that_finds_noise_is_left_out():
     assert "physics_alone" in [warning.code for warning in found.warnings]
     errors = {(c.focus, c.learner): c.error for c in found.focus.candidates}
     assert min(errors, key=errors.get)[1] is False
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_why_a_learner_is_left_out_agrees_with_the_errors(seed):
+    """Of errors that are nearly the same the simpler model is taken, so a learner's may be less."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(1, 5, 12), 5)
+    y = scipy.signal.lfilter([0, 0.4], [1, -0.8], u) + 0.05 * rng.normal(size=60)
+    physics = oa.Baseline.from_terms(
+        [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]"), oa.Term("c", "1")]
+    )
+    data = oa.Record.from_arrays(u, y, sampling_time=1)
+    found = oa.estimate(data, physics, learner=LEARNER, criterion=oa.Auto())
+    text = dict((w.code, w.text) for w in found.warnings)["physics_alone"]
+    least = min(c.error for c in found.focus.candidates if c.learner)
+    own = next(
+        c.error
+        for c in found.focus.candidates
+        if (c.focus, c.learner) == (found.focus.chosen, False)
+    )
+    assert text.startswith("the gain of a learner" if least < own else "no learner is better")
+    assert ("is not sure" in text) == (least < own)
 
 
 def test_a_learner_that_is_wanted_is_kept():

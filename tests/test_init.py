@@ -382,6 +382,75 @@ def test_on_a_terminal_it_asks_again(tmp_path, monkeypatch):
     )
 
 
+def batches(path, header: str = "") -> None:
+    """Ten batches of a slow first-order system, each from cold, with its own time."""
+    rng, rows = np.random.default_rng(5), []
+    for batch in range(1, 11):
+        x = 15.0
+        for k in range(90):
+            u = rng.uniform(20, 80) if k % 15 == 0 else u
+            x = 0.97 * x + 0.03 * u
+            rows.append((batch, 30 * k, u, x + 0.05 * rng.normal()))
+    frame = pd.DataFrame(rows, columns=["Batch", header or "t", "valve", "temp"])
+    (frame if header else frame.drop(columns="t")).to_csv(path, index=False)
+
+
+def test_the_error_of_the_first_physics_is_of_runs_within_experiments(tmp_path):
+    batches(tmp_path / "run.csv")
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
+    )
+    told = unfolded(done.out)
+    assert "Batch numbers 10 experiments" in told
+    error = re.search(r"error in free run is ([\d.]+) %", told)
+    assert error is not None and float(error[1]) < 5
+
+
+@pytest.mark.parametrize("header", ["time [s]", "Time in batch [s]", "Zeit seit Beginn [s]"])
+def test_a_time_that_begins_anew_gives_the_step_and_is_not_listed_as_left_out(tmp_path, header):
+    batches(tmp_path / "run.csv", header)
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
+    )
+    told = unfolded(done.out)
+    assert f"30 s is usual in column '{header}', which begins anew with each experiment" in told
+    assert "left out" not in told
+    assert load_spec(spec).train.record.sampling_time == 30
+
+
+def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
+    u, y = plant(100)
+    words = np.where(u > 0, "ON", "OFF")
+    pd.DataFrame({"pump": words, "flow": y}).to_csv(tmp_path / "run.csv", index=False)
+    options = ["--inputs", "pump", "--outputs", "flow", "--out", tmp_path / "spec.toml"]
+    done = run("init", tmp_path / "run.csv", *options)
+    assert done.code == 2
+    assert "no numbers. Its cells hold OFF and ON: write 0 and 1 for them" in unfolded(done.err)
+    done = run("init", tmp_path / "run.csv", "run2.csv", "run3.csv", *options)
+    assert done.code == 2 and "'run2.csv, run3.csv' besides" in done.err
+    assert "add the others to `files` of `train`" in unfolded(done.err)
+
+
+def test_units_in_the_row_under_the_header(tmp_path):
+    u, y = plant()
+    rows = "".join(f"{10 * k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True)))
+    (tmp_path / "run.csv").write_text(f"Zeit,valve,flow\nms,%,l/s\n{rows}", encoding="utf-8")
+    spec = tmp_path / "spec.toml"
+    done = run(
+        "init", tmp_path / "run.csv", "--out", spec, "--inputs", "valve", "--outputs", "flow"
+    )
+    told = unfolded(done.out)
+    assert f"{len(u)} rows, 3 columns; units are in the row under the header" in told
+    assert "sampling time: 0.01 s, from column 'Zeit'" in told
+    data = tomllib.loads(spec.read_text(encoding="utf-8"))["data"]
+    assert data["channels"] == {"valve": {"unit": "%"}, "flow": {"unit": "l/s"}}
+    assert data["time"] == "Zeit"
+    job = load_spec(spec)
+    assert job.train.record.sampling_time == pytest.approx(0.01)
+
+
 def test_dates_are_the_clock(tmp_path):
     u, y = plant(300)
     frame = pd.DataFrame(
@@ -626,11 +695,16 @@ NO_TIMES = {
     "a time that begins anew": (
         "time",
         EVEN % 4.0,
-        "falls from 3.98 to 0 in row 200, so it is not the time",
+        "0.02 s is usual in column 'time', which begins anew with each experiment",
+    ),
+    "minutes that are each in six rows": (
+        "time",
+        np.arange(300) // 6 * 0.12,
+        "0.02 s, because column 'time' has each instant in 6 rows",
     ),
     "instants that repeat": (
         "time",
-        np.floor(EVEN * 10),
+        np.floor((EVEN * 10) ** 1.3),
         "stays at 0 in row 1, so it is not the time",
     ),
     "a temperature": ("t", np.cos(EVEN), "falls in many rows, so it is taken for a signal"),
@@ -651,7 +725,8 @@ def test_why_a_column_is_not_the_time_is_said(request, tmp_path, header, values,
         "--out",
         tmp_path / "spec.toml",
     )
-    known = "0.02 s is usual" if "begins" in request.node.name else "no column states it"
+    known = "0.02 s, because" if "six rows" in request.node.name else "no column states it"
+    known = "0.02 s is usual" if "begins" in request.node.name else known
     assert done.code == 0 and f"sampling time: {known}" in done.out, done.err
     told = done.out.replace("\n  ", " ").splitlines()  # folded lines go on indented
     assert any(header in line and reason in line for line in told), done.out

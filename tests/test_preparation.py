@@ -232,6 +232,20 @@ def test_what_a_filter_does_to_theta_is_told():
     assert codes(oa.Lowpass(cutoff=9.0, channels=("y",))) == ["filtered_alone", "filtered_noise"]
 
 
+@pytest.mark.parametrize("focus", ["prediction", "simulation"])
+def test_the_free_run_is_advised_only_where_it_was_not_trained_on(tmp_path, focus):
+    text = make_project(tmp_path).read_text(encoding="utf-8")
+    step = '[[data.prepare]]\nstep = "decimate"\nfactor = 2\n'
+    spec = tmp_path / "other.toml"
+    spec.write_text(f'{text}{step}[training]\nfocus = "{focus}"\n', encoding="utf-8")
+    for command in (["check", spec, "--json"], ["fit", spec, "--json", "--out", tmp_path / "out"]):
+        done = run(*command)
+        assert done.code == 0, done.err
+        (told,) = (w["text"] for w in json.loads(done.out)["warnings"] if "filtered" in w["code"])
+        assert ("training.focus" in told) == ("one step ahead" in told) == (focus == "prediction")
+        assert "Compare with a fit to the data as they are" in told
+
+
 def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = make_project(tmp_path)

@@ -159,6 +159,24 @@ def test_a_cell_that_is_no_finite_number(tmp_path, cell):
     assert len(read(path, outputs=[])) == 4
 
 
+@pytest.mark.parametrize(
+    ("cell", "remedy"),
+    [("Bad", "empty it where its sample is missing: `missing` = "), ("ON", "Write 0 and 1")],
+)
+def test_a_cell_of_words_is_refused_with_a_remedy(tmp_path, cell, remedy):
+    with pytest.raises(InputError, match=f"found '{cell}'; .*{remedy}"):
+        read(put(tmp_path, f"u,y\n1,2\n3,4\n5,{cell}\n7,8\n"))
+
+
+def test_instants_in_milliseconds_since_1970_name_the_header_that_reads_them(tmp_path):
+    rows = "".join(f"{1709294100000 + 1000 * k},{k % 3},{k % 5}\n" for k in range(20))
+    path = put(tmp_path, f"stamp,u,y\n{rows}")
+    with pytest.raises(InputError, match=r"the unit in the header, such as 'stamp \[ms\]'"):
+        read(path, time="stamp", sampling_time=None)
+    path = put(tmp_path, f"stamp [ms],u,y\n{rows}", "other.csv")
+    assert read(path, time="stamp [ms]", sampling_time=None).sampling_time == 1
+
+
 def test_an_empty_cell(tmp_path):
     for cells in (",6", '"",6', "  ,6"):
         with pytest.raises(

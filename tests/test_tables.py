@@ -128,6 +128,62 @@ def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, 
     assert values(path, "u", "y") == [[1.5, 3.0], [2.0, 4.5]]
 
 
+UNITS_UNDER_NAMES = {
+    "all": ("t,u,y\nms,V,cm\n20,1,2\n40,3,4\n", {"t": "ms", "u": "V", "y": "cm"}),
+    "brackets": ("t;u;y\n[ms];(V);[%]\n20;1;2\n40;3;4\n", {"t": "ms", "u": "V", "y": "%"}),
+    "spaces": ("t u y\n[ms] [V] [cm]\n20 1 2\n40 3 4\n", {"t": "ms", "u": "V", "y": "cm"}),
+    "commas": ("t;u;y\nms;V;cm\n20,0;1,0;2\n40,0;3;4\n", {"t": "ms", "u": "V", "y": "cm"}),
+    "without some": ("t,u,y,note\nms,-,cm,\n20,1,2,\n40,3,4,warm\n", {"t": "ms", "y": "cm"}),
+    "gaps below": ("t,u,y,z\nms,V,cm,\n20,1,2,\n40,3,4,7\n", {"t": "ms", "u": "V", "y": "cm"}),
+    "a line above": ("bench 3\n\nt,u,y\nms,V,cm\n20,1,2\n40,3,4\n", dict(t="ms", u="V", y="cm")),
+}
+
+
+@pytest.mark.parametrize(
+    ("content", "units"), UNITS_UNDER_NAMES.values(), ids=UNITS_UNDER_NAMES.keys()
+)
+def test_a_row_of_units_under_the_header_is_no_sample(tmp_path, content, units):
+    path = put(tmp_path, "run.csv", content)
+    table = read_table(path, ["t", "u", "y"], "t")
+    assert {name: column.tolist() for name, column in table.columns.items()} == {
+        "t": [0.02, 0.04],
+        "u": [1.0, 3.0],
+        "y": [2.0, 4.0],
+    }
+    assert table.units == units
+    first = 1 + next(i for i, line in enumerate(content.split("\n")) if line.startswith("20"))
+    assert table.where(0) == f"line {first} (row 0)"
+    assert column_names(path)[:3] == ["t", "u", "y"]
+
+
+def test_a_row_of_units_in_a_workbook(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in (["t", "u [V]", "y"], ["ms", "mV", "cm"], [20, 1, 2], [40, None, 4]):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    table = read_table(tmp_path / "run.xlsx", ["t", "y"], "t")
+    assert [table.columns[name].tolist() for name in ("t", "y")] == [[0.02, 0.04], [2.0, 4.0]]
+    assert table.where(0) == "line 3 (row 0)"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "t,u,y\n0,Bad,Bad\n1,1,2\n2,3,4\n",
+        "t,u,y\nnan,nan,nan\n1,1,2\n2,3,4\n",
+        "t,u,y\n,,\n1,1,2\n2,3,4\n",
+        "t,u,y\nthe time of day,the voltage,cm\n1,1,2\n2,3,4\n",
+        "note,u,y\nwarm,,\n1,1,2\n2,3,4\n",
+        "t,u,y\nms,V,cm\nms,V,cm\n1,1,2\n",
+    ],
+)
+def test_a_first_row_that_holds_no_units_stays_a_row(tmp_path, content):
+    table = read_table(put(tmp_path, "run.csv", content), ["u", "y"])
+    assert not table.units
+    assert np.isnan(table.columns["u"][0])
+
+
 def test_columns_of_one_name_are_told_apart(tmp_path):
     path = put(tmp_path, "run.csv", "T [K],u,T [K],T [K]\n1,2,3,4\n")
     assert column_names(path) == ["T [K].0", "u", "T [K].1", "T [K].2"]

@@ -191,6 +191,17 @@ def test_rows_of_a_coarse_output_repeat_by_chance(tmp_path):
     assert not text_of(told(tmp_path, SPEC), "repeated_rows")
 
 
+def test_rows_of_a_long_record_in_fine_steps_repeat_by_chance(tmp_path):
+    rng = np.random.default_rng(4)
+    u = np.repeat(100 * rng.normal(size=100), 300)
+    y = scipy.signal.lfilter([0, 0.01], [1, -0.99], u) + 0.01 * rng.normal(size=len(u))
+    cells = np.round(np.column_stack([u, y]), 3)
+    assert np.ptp(cells[:, 1]) > 1e5 * 0.001
+    assert (np.diff(cells, axis=0) == 0).all(axis=1).sum() > 20
+    np.savetxt(tmp_path / "run.csv", cells, delimiter=",", header="u,y", comments="")
+    assert not text_of(told(tmp_path, SPEC), "repeated_rows")
+
+
 def test_single_rows_that_were_written_twice_are_named(tmp_path):
     measured(tmp_path, "again")
     text = text_of(told(tmp_path, SPEC), "repeated_rows")

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import zip_longest
 
 WIDTH = 100  # columns of what is printed, at most
 _NARROWEST = 40  # below, folded tables are harder to read than lines that the terminal breaks
@@ -197,6 +198,34 @@ def table(
             for row in whole
         ]
     return lines
+
+
+def continued(rows: Sequence[Sequence[str]], indent: int = 0) -> list[list[str]]:
+    """Return rows whose table fits the screen: what is too long for a cell goes on in a row below.
+
+    Columns that are narrower than an equal share keep their width, and the others share the rest.
+
+    Examples:
+        >>> with narrow_screen(20):
+        ...     continued([["seen", "determined"], ["u, v", "a, b, c, d, e, f"]])
+        [['seen', 'determined'], ['u, v', 'a, b, c, d, e,'], ['', 'f']]
+    """
+    widths = _widths(rows)
+    left = _screen[0] - indent - len(_GAP) * (len(widths) - 1)
+    share = list(range(len(widths)))
+    while share and (narrow := [i for i in share if widths[i] <= left // len(share)]):
+        left -= sum(widths[i] for i in narrow)
+        share = [i for i in share if i not in narrow]
+    for i in share:
+        widths[i] = max(left // len(share), 1)
+    whole: list[list[str]] = []
+    for row in rows:
+        cells = [
+            textwrap.wrap(cell, most, break_long_words=False, break_on_hyphens=False) or [""]
+            for cell, most in zip(row, widths, strict=True)
+        ]
+        whole += [list(parts) for parts in zip_longest(*cells, fillvalue="")]
+    return whole
 
 
 def _widths(rows: Sequence[Sequence[str]]) -> list[int]:

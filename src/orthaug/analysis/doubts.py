@@ -156,6 +156,9 @@ def _noise_only(
 
 
 def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result: Findings) -> str:
+    rows = (*(result.parameters or ()), *(result.physical_parameters or ()))
+    given = any(row.ci95 is not None for row in rows)
+    only = "The 95 % intervals count noise only. " if given else ""
     if left > _LEFT:
         what = f"the model's error contains more than noise: {_functions_text(left)}"
     elif test is None or not test.found:
@@ -165,9 +168,9 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             kind = "innovations" if result.motion is not None else "auto"
             return (
                 f"{what}, and neither the inputs nor functions of the regressors predict it: a "
-                "disturbance with a memory of its own is likely. The 95 % intervals count noise "
-                f'only. Describe it by `noise.model` = "{kind}"; if physics with memory is '
-                "missing instead, such as a hysteresis, that does not make the intervals right."
+                f"disturbance with a memory of its own is likely. {only}Describe it by "
+                f'`noise.model` = "{kind}"; if physics with memory is missing instead, such as a '
+                "hysteresis, that does not make the intervals right."
             )
     elif test.is_far:
         what = (
@@ -192,10 +195,13 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
         else "Fit with a learner that sees what the missing terms may depend on; `orthaug explain` "
         "then names them."
     )
-    return (
-        f"{what}. The 95 % intervals count noise only; missing physics may have moved the "
-        f"parameters by more. {remedy}"
+    moved = (
+        "The 95 % intervals count noise only; missing physics may have moved the parameters by "
+        "more."
+        if given
+        else "Missing physics may have moved the parameters."
     )
+    return f"{what}. {moved} {remedy}"
 
 
 def _is_disturbance(fit: Any, result: Findings) -> bool:

@@ -32,6 +32,7 @@ from orthaug.analysis.validation import (
     score_trial,
     trials_of,
 )
+from orthaug.data.preparation import of_free_run
 from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.estimates import Estimate
@@ -82,7 +83,10 @@ def examine(fit: Estimate, evidence: Evidence) -> Examination:
 def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     """Return a fit scored on every part, with the findings on it but verdict and doubts."""
     Stage.SCORES.enter()
-    warnings: list[Warning] = [*evidence.warnings, *fit.warnings]
+    known, record = evidence.warnings, fit.problem.record
+    if not fit.criterion.one_step:
+        known = of_free_run(known, record.prepared, [channel.name for channel in record.channels])
+    warnings: list[Warning] = [*known, *fit.warnings]
     scores, responses = {}, {}
     if fit.status.ok:
         for part in evidence.parts:

@@ -24,7 +24,7 @@ from orthaug.commands.bars import GO_ON, on_terminal, study_bars, training_bar
 from orthaug.commands.program import (
     AsJson,
     Force,
-    ListOptionCommand,
+    OneFileCommand,
     SpecPath,
     app,
     arguments,
@@ -337,7 +337,7 @@ def select(
 
 
 @app.command(
-    cls=ListOptionCommand, epilog="Example: orthaug init run.csv --inputs force --outputs position"
+    cls=OneFileCommand, epilog="Example: orthaug init run.csv --inputs force --outputs position"
 )
 def init(
     data: Annotated[Path, typer.Argument(metavar="DATA", help="Data file.")],

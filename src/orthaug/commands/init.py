@@ -392,10 +392,10 @@ def _check_no_time(found: Survey, column: Column, kind: str, sampling_time: floa
         raise InputError(
             f"{place} rises by {found.clock.step:g} s in each row, as time does; {remedy}."
         )
-    if refused is not None and (kind == "output" or is_time(column.header)):
+    if refused is not None and (kind == "output" or is_time(column.titled)):
         raise InputError(
             f"{place} {refused.reason}; it is no "
-            f"{'channel' if is_time(column.header) else 'output'}."
+            f"{'channel' if is_time(column.titled) else 'output'}."
         )
 
 
@@ -676,6 +676,8 @@ def _record(found: Survey, roles: Roles, rows: tuple[int, int], missing: int) ->
     }
     if roles.keeps:
         options["missing"] = "keep"
+    apart = found.experiment_column([*roles.inputs, *roles.outputs])
+    options["experiment"] = None if apart is None else apart.header
     options["prepare"] = [STEPS.declare(kind, keys) for kind, keys in steps_of(found, roles)]
     if not found.clock.even:
         options["time"] = time_of(found, roles)
@@ -727,6 +729,8 @@ def _account(
         used.add(id(apart))
         count = len(np.unique(apart.finite))
         lines.append(f"{apart.header} numbers {count} experiments; their rows are read apart")
+    if roles.sampling_time is None:
+        used.add(id(found.clock.faulty))  # the line of the sampling time tells its fault
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
     for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):

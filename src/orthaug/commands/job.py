@@ -20,6 +20,7 @@ from orthaug._base.progress import SILENT, Plan, Progress
 from orthaug.analysis.evidence import DEFAULT_BLOCKS, Evidence, sample_warnings
 from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec, load_spec
+from orthaug.data.preparation import of_free_run
 from orthaug.data.record import Record
 from orthaug.reports.result import DataResult, PreparedResult
 
@@ -326,7 +327,11 @@ class Job:
     @property
     def warnings(self) -> tuple[Warning, ...]:
         """Warnings on the data, on training samples that are no measurements, on terms left out."""
-        of_parts = (warning for part in self.parts for warning in part.warnings)
+        of_parts = [warning for part in self.parts for warning in part.warnings]
+        if not self.spec.declared_criterion().one_step:
+            record = self.train.record
+            names = [channel.name for channel in record.channels]
+            of_parts = of_free_run(of_parts, record.prepared, names)
         return (*of_parts, *self._of_samples, *self.left_out)
 
     @cached_property

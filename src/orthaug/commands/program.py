@@ -15,7 +15,7 @@ import typer.core
 
 from orthaug import __version__
 from orthaug._base.checks import check_choice
-from orthaug._base.errors import InputError, TrainingError
+from orthaug._base.errors import InputError, TrainingError, show
 from orthaug._base.folders import PARTIALS
 from orthaug.commands import streams
 from orthaug.commands.signals import WATCH, ending_message
@@ -71,6 +71,20 @@ class ListOptionCommand(typer.core.TyperCommand):
         }
         lists = {name for name, option in valued.items() if getattr(option, "multiple", False)}
         return super().parse_args(ctx, _repeat_options(args, lists, set(valued)))
+
+
+class OneFileCommand(ListOptionCommand):
+    """A command that takes one data file, and says what to do with further ones."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.allow_extra_args = True
+        super().parse_args(ctx, args)
+        if ctx.args:
+            ctx.fail(
+                f"{ctx.info_name} takes one file, and found {show(', '.join(ctx.args))} besides. "
+                "Write the spec from one of them, and add the others to `files` of `train` there."
+            )
+        return []
 
 
 def _repeat_options(args: Sequence[str], lists: Set[str], valued: Set[str]) -> list[str]:

@@ -12,9 +12,9 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.data.columns import Column
-from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time
+from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time, with_unit
 from orthaug.data.record import same_step
-from orthaug.data.tables import column_names, read_table
+from orthaug.data.tables import read_table, read_titles
 from orthaug.data.variables import ENDINGS, scalars
 
 # Largest deviation of a step from the usual one, relative: one lost sample deviates by 1 or ½.
@@ -70,6 +70,16 @@ class Clock:
         return self.seconds is not None
 
     @property
+    def faulty(self) -> Column | None:
+        """The column named as the time that has a fault, where the step is that of most its rows.
+
+        None where the step is from elsewhere.
+        """
+        if self.step is None or self.column is not None:
+            return None
+        return next((one.column for one in self.refused if one.fault), None)
+
+    @property
     def restarts(self) -> tuple[int, ...]:
         """Rows at which a column named as the time begins anew: those of further experiments."""
         for one in self.refused:
@@ -96,7 +106,7 @@ class Clock:
         Otherwise only its values do.
         """
         return self.column is not None and (
-            not self.instants or bool(self.column.unusable) or is_time(self.column.header)
+            not self.instants or bool(self.column.unusable) or is_time(self.column.titled)
         )
 
     def __str__(self) -> str:
@@ -104,12 +114,18 @@ class Clock:
             return "no column states it"
         if self.column is None:
             one = next(one for one in self.refused if one.fault)
-            return f"{self.step:g} s is usual in column '{one.column.header}', which {one.fault}"
+            if (held := _rows_of_each(one.column.finite)) > 1:
+                named = f"column '{one.column.header}'"
+                return f"{self.step:g} s, because {named} has each instant in {held} rows"
+            fault = "begins anew with each experiment" if self.restarts else one.fault
+            return f"{self.step:g} s is usual in column '{one.column.header}', which {fault}"
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
             known += (
-                "" if split_header(header)[1] else " and whose header has no unit; s is assumed"
+                ""
+                if split_header(self.column.titled)[1]
+                else " and whose header has no unit; s is assumed"
             )
         if not self.even:
             text = f"{self.step:g} s is usual in column '{header}'{known}, but the steps are uneven"
@@ -137,33 +153,33 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     parent = _parent(near)
     clock, refused = Clock(), []
     for column in sorted(
-        columns, key=lambda c: (not is_time(c.header), bool(near) and _parent(c.header) != parent)
+        columns, key=lambda c: (not is_time(c.titled), bool(near) and _parent(c.header) != parent)
     ):
         values, dates = column.finite, column.unusable == DATES
         if column.unusable and not dates:
             continue
-        step = step_of(column.header, float(values[0])) if column.constant else None
+        step = step_of(column.titled, float(values[0])) if column.constant else None
         if step is not None and clock.column is None:
             clock = Clock(step, column)
-        if not (dates or is_time(column.header)):
+        if not (dates or is_time(column.titled)):
             continue
         fault = _fault(column, rows)
         if fault is not None and not column.constant:
             refused.append(fault)
         elif fault is None and clock.column is None:
             clock = _column_clock(
-                column, column.values if dates else in_seconds(column.values, column.header)
+                column, column.values if dates else in_seconds(column.values, column.titled)
             )
         elif fault is None and not dates:
             refused.append(
                 RefusedColumn(column, "rises as a time does, and another column is the time", False)
             )
     for column in columns:
-        if column.unusable or column is clock.column or is_time(column.header):
+        if column.unusable or column is clock.column or is_time(column.titled):
             continue
         verdict = _resemblance(column)
         if verdict is None and clock.column is None and column.filled == rows:
-            clock = _column_clock(column, in_seconds(column.values, column.header))
+            clock = _column_clock(column, in_seconds(column.values, column.titled))
         elif verdict is None:
             refused.append(
                 RefusedColumn(
@@ -174,10 +190,11 @@ def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
             refused.append(verdict)
     faulty = next((one for one in refused if one.fault), None)
     if clock.step is None and faulty is not None:
-        steps = np.diff(in_seconds(faulty.column.finite, faulty.column.header))
-        clock = Clock(float(f"{np.median(steps[steps > 0]):.6g}"))
+        steps = np.diff(in_seconds(faulty.column.finite, faulty.column.titled))
+        step = np.median(steps[steps > 0]) / _rows_of_each(faulty.column.finite)
+        clock = Clock(float(f"{step:.6g}"))
     kept = tuple(
-        one for one in refused if not clock.instants or not one.signal or is_time(one.column.header)
+        one for one in refused if not clock.instants or not one.signal or is_time(one.column.titled)
     )
     return replace(clock, refused=kept)
 
@@ -204,6 +221,10 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
         )
     if len(steps) and not ((steps > 0).mean() >= _RISES or (steps >= 0).all()):
         return RefusedColumn(column, "falls in many rows, so it is taken for a signal", True)
+    held = _rows_of_each(values)
+    if held > 1:
+        fault = f"has each instant in {held} rows"
+        return RefusedColumn(column, f"{fault}, so it is not the time", False, fault)
     at = int(np.flatnonzero(steps <= 0)[0]) + 1 if len(steps) else 0
     row = int(np.flatnonzero(np.isfinite(column.values))[at])
     went = f"stays at {values[at]:g}"
@@ -211,6 +232,20 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
     fault = f"{went} in row {row}" if len(steps) and (steps > 0).mean() >= _RISES else ""
     return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False, fault)
+
+
+def _rows_of_each(values: Vector) -> int:
+    """Return in how many rows each instant is, as where seconds are left out; 1 where they vary."""
+    steps = np.diff(values)
+    begins = np.flatnonzero(steps > 0) + 1
+    rows = np.diff(begins)  # of the first and the last instant there may be fewer
+    if len(rows) < _FEWEST or (steps < 0).any():
+        return 1
+    usual, moved = int(np.median(rows)), steps[begins - 1]
+    alike = (rows == usual).mean() >= _MOSTLY and np.isclose(
+        moved, np.median(moved)
+    ).mean() >= _MOSTLY
+    return usual if alike and max(begins[0], len(values) - begins[-1]) <= usual else 1
 
 
 def _resemblance(column: Column) -> RefusedColumn | bool | None:
@@ -224,7 +259,7 @@ def _resemblance(column: Column) -> RefusedColumn | bool | None:
     steps = np.diff(values) / np.diff(rows)
     if len(steps) < _FEWEST - 1 or not (steps > 0).all():
         return False
-    header, usual = column.header, float(np.median(steps))
+    header, usual = column.titled, float(np.median(steps))
     line = np.interp(rows, rows[[0, -1]], values[[0, -1]])
     on_line = bool(np.abs(values - line).max() < 0.5 * steps.mean())
     thirds = [float(np.median(part)) for part in np.array_split(steps, 3)]
@@ -256,21 +291,23 @@ def read_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         apart: columns that are channels, whatever they are called.
         by_content: look at columns of any name.
     """
-    wanted = [name for name in column_names(path) if name not in apart]
-    wanted = [name for name in wanted if by_content or is_time(name) or step_of(name, 1.0)]
+    titles = read_titles(path)
+    titled = {n: with_unit(n, titles.units.get(n, "")) for n in titles.names if n not in apart}
+    wanted = [n for n, t in titled.items() if by_content or is_time(t) or step_of(t, 1.0)]
     columns, values = [], {}
     if by_content and wanted:
         with suppress(InputError):  # one of them holds no numbers: each by itself
-            values = read_table(path, list(dict.fromkeys(wanted)), most=_HEAD).columns
+            values = read_table(path, wanted, most=_HEAD).columns
     for header in wanted:
         with suppress(InputError):
-            named = header if is_time(header) else None  # it comes in s, as dates do
+            named = header if is_time(titled[header]) else None  # it comes in s, as dates do
             if named or header not in values:
                 values = {
                     **values,
                     header: read_table(path, [header], named, most=_HEAD).columns[header],
                 }
-            columns.append(Column(header, header, "", values[header], DATES if named else ""))
+            unit = titles.units.get(header, "")
+            columns.append(Column(header, header, unit, values[header], DATES if named else ""))
     clock = find_clock(columns) if columns else Clock()
     return clock if clock.column else by_single_number(path)
 

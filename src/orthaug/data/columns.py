@@ -14,7 +14,7 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import LONGEST
 from orthaug.data.expressions import SAMPLING_TIME, is_name
-from orthaug.data.headers import last_part, split_header
+from orthaug.data.headers import last_part, split_header, with_unit
 from orthaug.data.steps import Outliers
 
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
@@ -54,6 +54,11 @@ class Column:
     values: Vector
     unusable: str = ""
     """Reason why it can be no channel."""
+
+    @property
+    def titled(self) -> str:
+        """The header with its unit, which may be in a row of units under it."""
+        return with_unit(self.header, self.unit)
 
     @property
     def finite(self) -> Vector:

@@ -24,7 +24,9 @@ _UNITS = re.compile(
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
 _TIME = re.compile(
     r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|"
-    r"elapsed([ _]?time)?|sec|seconds)$",
+    r"elapsed([ _]?time)?|sec|seconds|"
+    r"(time|zeit)[ _](in|within|since|im|in der|seit)([ _](the|of|dem|der))?[ _]"
+    r"(batch|run|test|trial|cycle|experiment|session|start|begin|charge|lauf|versuch|beginn))$",
     re.IGNORECASE,
 )
 _STEP = re.compile(r"^(ts|dt|t_s|sampling_?time|sample_?time)$", re.IGNORECASE)
@@ -64,6 +66,11 @@ def split_header(header: str) -> tuple[str, str]:
                 "_min", "/min"
             ).replace("s2", "s^2")
     return header, ""
+
+
+def with_unit(header: str, unit: str) -> str:
+    """Return a header with the unit that is elsewhere, as under it; one of its own stays."""
+    return f"{header} [{unit}]" if unit and not split_header(header)[1] else header
 
 
 def last_part(name: str) -> str:

@@ -28,6 +28,14 @@ _COMMA = re.compile(r"(\d*),(\d+)")
 _DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
 MISSING = ("", "nan", "na", "n/a", "#n/a", "n.a.", "n.v.", "null", "none", "-", "--")
 """Words of a cell without a sample, in small letters."""
+_NO_UNIT = ("", "-", "--")  # cells of a row of units without one
+_LONGEST_UNIT = 12  # letters
+_BELOW = 5  # rows under the units that show which columns hold numbers
+STATES = frozenset(
+    ("on", "off", "true", "false", "yes", "no", "open", "closed", "ein", "aus", "auf", "zu")
+    + ("ja", "nein", "start", "stop", "high", "low")
+)
+"""Words of a state, in small letters, for which numbers can be written."""
 _BLANK = " "  # the separator that means any run of spaces and tabs
 _SEPARATORS = ("\t", ";", ",", _BLANK)
 _WITH_UNIT = re.compile(r'"[^"]*"|[^\s"]+(?:\s+(?:\[[^\]]*\]|\([^)]*\)))?')
@@ -52,7 +60,8 @@ _PROLOGUE = 4096  # bytes of a part in which a document type would be
 class Layout(NamedTuple):
     """Layout of a text table: names, lines above the first row, separator, encoding.
 
-    It also holds whether names were read.
+    It also holds whether names were read, and the units in a row of their own under the names, one
+    for each name; none where there is no such row, which counts as one above the first row.
 
     The separator `" "` means any run of spaces and tabs. Columns without names are `x1`, `x2`,
     …
@@ -63,6 +72,7 @@ class Layout(NamedTuple):
     separator: str
     encoding: str
     headed: bool = True
+    units: tuple[str, ...] = ()
 
     @property
     def note(self) -> str:
@@ -196,7 +206,46 @@ def _layout(path: Path, encoding: str, columns: Sequence[str]) -> Layout:
         )
     cells, number = _below_remarks(rows, separator)
     names = _with_places([name.strip() for name in cells], columns)
-    return Layout(names, number, separator, encoding)
+    below = [(text, line) for text, line in ahead if line > number]
+    units = _units(names, [_row(text, separator) for text, _ in below[: _BELOW + 1]], separator)
+    return Layout(names, below[0][1] if units else number, separator, encoding, units=units)
+
+
+def _row(line: str, separator: str) -> list[str]:
+    """Return the cells of a line that is no header: a unit between spaces is a cell of its own."""
+    return line.split() if separator == _BLANK else _cells(line, separator)
+
+
+def _units(names: list[str], rows: list[list[str]], separator: str) -> tuple[str, ...]:
+    """Return the units of columns where the first row below the names holds them.
+
+    It does where the rows below it show numbers, and it has short texts in at least half of these
+    columns and a number or a missing sample in none. Empty where it does not.
+    """
+    if len(rows) < 2 or len(rows[0]) < 1:
+        return ()
+    count = len(names)
+    first, *below = ([cell.strip() for cell in [*row, *[""] * count][:count]] for row in rows)
+
+    def is_value(cell: str) -> bool:
+        return _is_number(cell, separator) or _DATE.fullmatch(cell) is not None
+
+    numbers = [
+        j
+        for j in range(count)
+        if any(is_value(row[j]) for row in below)
+        and all(is_value(row[j]) or row[j].lower() in MISSING for row in below)
+    ]
+    cells = [first[j] for j in numbers]
+    texts = [cell for cell in cells if cell not in _NO_UNIT]
+    if not texts or 2 * len(texts) < len(cells):
+        return ()
+    if any(is_value(one) or one.lower() in MISSING or len(one) > _LONGEST_UNIT for one in texts):
+        return ()
+    bare = [re.sub(r"^[\[(](.*)[\])]$", r"\1", cell).strip() for cell in first]
+    return tuple(
+        "" if cell in _NO_UNIT or j not in numbers else cell for j, cell in enumerate(bare)
+    )
 
 
 def _with_places(names: list[str], columns: Sequence[str]) -> list[str]:
@@ -357,12 +406,13 @@ def numbers_only(names: list[str]) -> bool:
     return found != [str(i) for i in range(len(found))]
 
 
-def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]]]:
-    """Return the row of the header, counted from 1, and the cells below it.
+def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]], tuple[str, ...]]:
+    """Return the last row above the cells, counted from 1, the cells, and the units.
 
     The cells are those of the columns that `place` finds in the header.
 
-    The first row that holds anything is the header. A cell that is not there is None.
+    The first row that holds anything is the header. A row of units may be under it; otherwise there
+    are none. A cell that is not there is None.
 
     Raises:
         InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than
@@ -458,11 +508,14 @@ def _check_strings(sheet: Any) -> None:
         sheet._shared_strings = _Strings(sheet._shared_strings or ())
 
 
-def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]]]:
-    header, cells = 0, []
+def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]], tuple[str, ...]]:
+    header, cells, names = 0, [], []
+    begin: list[list[str]] = []  # the first rows, as texts
     places: Sequence[int] = ()
     for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
         if header:
+            if len(begin) <= _BELOW:
+                begin.append(["" if c is None else c if isinstance(c, str) else "0" for c in row])
             for column, index in zip(cells, places, strict=True):
                 column.append(row[index] if index < len(row) else None)
         elif any(cell is not None for cell in row):
@@ -471,7 +524,8 @@ def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]]]:
             cells = [[] for _ in places]
     if not header:
         raise InputError(f"{path}: the first worksheet is empty.")
-    return header, cells
+    units = _units(names, begin, ",")
+    return (header + 1, [column[1:] for column in cells], units) if units else (header, cells, ())
 
 
 def as_number(value: Any) -> float:

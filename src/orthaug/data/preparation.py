@@ -360,8 +360,15 @@ def steps_again(
     return tuple(steps), sampling_time
 
 
-def warnings_of(prepared: Sequence[Preparation], names: Sequence[str]) -> tuple[Warning, ...]:
-    """Return warnings about a fit to data that were prepared so."""
+def warnings_of(
+    prepared: Sequence[Preparation], names: Sequence[str], *, free_run: bool = False
+) -> tuple[Warning, ...]:
+    """Return warnings about a fit to data that were prepared so.
+
+    `free_run` says that it is trained on the free run, as is advised otherwise.
+    """
+    biased, other = ", which biases θ one step ahead", ', and with training.focus = "simulation"'
+    biased, other = ("", "") if free_run else (biased, other)
     found = []
     for done in prepared:
         channels = done.options.get("channels")
@@ -380,10 +387,18 @@ def warnings_of(prepared: Sequence[Preparation], names: Sequence[str]) -> tuple[
         found.append(
             Warning(
                 "filtered_noise",
-                f"{done.step} colours the noise{late}: residuals are correlated, which biases "
-                "θ one step ahead. A nonlinear term of filtered signals differs from the "
-                "filtered term. Compare with a fit to the data as they are, and with "
-                'training.focus = "simulation".',
+                f"{done.step} colours the noise{late}: residuals are correlated{biased}. A "
+                "nonlinear term of filtered signals differs from the filtered term. Compare with "
+                f"a fit to the data as they are{other}.",
             )
         )
     return tuple(found)
+
+
+def of_free_run(
+    warnings: Sequence[Warning], prepared: Sequence[Preparation], names: Sequence[str]
+) -> tuple[Warning, ...]:
+    """Return warnings of which those on preparation advise no free run, since it is trained on."""
+    before, after = (warnings_of(prepared, names, free_run=free_run) for free_run in (False, True))
+    instead = dict(zip(before, after, strict=True))
+    return tuple(instead.get(warning, warning) for warning in warnings)

@@ -18,7 +18,7 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, show
 from orthaug._base.lines import plural
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
-from orthaug.data.layouts import MISSING, text_number
+from orthaug.data.layouts import MISSING, STATES, text_number
 from orthaug.data.preparation import check_steps, prepared_experiments
 from orthaug.data.record import (
     Channel,
@@ -442,7 +442,18 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             wanted = f"{kind}, as in other cells" if kind else "a finite number"
             raise error(
                 f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}."
+                f"{'' if kind or error is MissingSampleError else _remedy(text)}"
             )
+
+
+def _remedy(text: str) -> str:
+    """Return what to do about a cell that holds a word."""
+    if text.strip().lower() in STATES:
+        return " Write 0 and 1 for such words."
+    return (
+        ' Correct the cell, or empty it where its sample is missing: `missing` = "skip" in [data] '
+        "in [data] leaves such rows out."
+    )
 
 
 def _check_rising(table: Table, time: str, start: int, stop: int) -> None:
@@ -523,6 +534,7 @@ def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
     if np.abs(instants).max() > _LATEST:
         raise InputError(
             f"{table.path}: column '{time}': instants of {np.abs(instants).max():.3g} are not "
-            "seconds; perhaps they are milli- or nanoseconds since 1970. Write seconds."
+            "seconds; perhaps they are milli- or nanoseconds since 1970. Write seconds, or the "
+            f"unit in the header, such as '{time} [ms]'."
         )
     return mean

@@ -11,15 +11,17 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, show
+from orthaug._base.lines import join_words
 from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
 from orthaug.data.headers import split_header
-from orthaug.data.layouts import numbers_only
-from orthaug.data.tables import column_names, read_table, reading_note
+from orthaug.data.layouts import STATES, numbers_only
+from orthaug.data.tables import read_table, read_titles, reading_note
 from orthaug.data.variables import ENDINGS
 
 _MOST_EXPERIMENTS = 50  # that a column of the file may number
 _SHORTEST_EXPERIMENT = 20  # rows
+_LOOKED_AT = 1000  # rows in which the words of a column are looked for
 # Names of a column that numbers the experiments
 _NUMBERING = frozenset(
     ("id", "experiment", "exp", "run", "run_id", "trial", "test", "batch", "cycle", "session")
@@ -138,12 +140,24 @@ class Survey:
         if column.unusable:
             raise InputError(
                 f"{self.path}: column '{name}' cannot be a channel: {column.unusable}."
+                f"{self._remedy(column)}"
             )
         if column.constant:
             raise InputError(
                 f"{self.path}: column '{name}' is {column.finite[0]:g} in every row; leave it out."
             )
         return column
+
+    def _remedy(self, column: Column) -> str:
+        """Return what to do about a column of words; empty where it holds something else."""
+        words: list[str] = []
+        with suppress(InputError):  # columns of text that no reader takes
+            table = read_table(self.path, [column.header])
+            rows = range(min(table.filled[column.header], _LOOKED_AT))
+            words = sorted({text for row in rows if (text := table.cell(column.header, row))})
+        if not words or {word.strip().lower() for word in words} - STATES:
+            return ""
+        return f" Its cells hold {join_words(words)}: write 0 and 1 for them."
 
     @property
     def contradicted(self) -> bool:
@@ -177,7 +191,7 @@ def survey(path: Path) -> Survey:
             numbers.
     """
     columns: list[Column] = []
-    every = list(column_names(path))
+    every, units = read_titles(path)
     if numbers_only(every):
         raise InputError(
             f"{path}: the first line holds numbers; a header with names is expected there. "
@@ -191,6 +205,7 @@ def survey(path: Path) -> Survey:
         refused = error
     for header in headers:
         base, unit = split_header(header)
+        unit = unit or units.get(header, "")
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
             unusable = "" if np.isfinite(values).any() else "no numbers"
@@ -213,7 +228,8 @@ def survey(path: Path) -> Survey:
     clock = find_clock(columns)
     if clock.column is None and clock.step is None:
         clock = replace(by_single_number(path), refused=clock.refused)
-    return Survey(path, tuple(columns), clock, reading_note(path))
+    notes = [reading_note(path), "units are in the row under the header" if units else ""]
+    return Survey(path, tuple(columns), clock, "; ".join(filter(None, notes)))
 
 
 def _as_dates(path: Path, header: str) -> tuple[Vector, str]:

@@ -9,9 +9,9 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from orthaug._base.errors import InputError, MissingColumnError, MissingFileErro
 from orthaug._base.memory import check_memory
 from orthaug._base.plugins import READERS, discover
 from orthaug._base.progress import LOG
-from orthaug.data.headers import in_seconds, parse_dates
+from orthaug.data.headers import in_seconds, parse_dates, with_unit
 from orthaug.data.layouts import (
     Layout,
     as_number,
@@ -54,6 +54,8 @@ class Table:
     first_line: int | None = None
     cell: Callable[[str, int], str] = lambda column, row: "nan"
     dated: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of columns from a row under the header."""
 
     def where(self, row: int) -> str:
         """Return `line 17 (row 15)` of a text file, `row 15` of others."""
@@ -68,8 +70,8 @@ def read_table(
     """Return the named columns of a file.
 
     Args:
-        time: the one of them that holds instants, numbers in the unit of its header or dates: it
-            comes in s.
+        time: the one of them that holds instants, numbers in the unit of its header, or of the row
+            of units under it, or dates: it comes in s.
         most: rows that are enough, where a file can be read in part; None for all.
 
     Raises:
@@ -83,7 +85,8 @@ def read_table(
         table = reader(path, columns, time, **part)
     if time is None or table.dated:
         return table
-    return replace(table, columns={**table.columns, time: in_seconds(table.columns[time], time)})
+    seconds = in_seconds(table.columns[time], with_unit(time, table.units.get(time, "")))
+    return replace(table, columns={**table.columns, time: seconds})
 
 
 def has_column(path: Path, name: str) -> bool:
@@ -105,22 +108,45 @@ def column_names(path: Path) -> list[str]:
     Raises:
         InputError: no such file, an unknown ending, content that does not fit it.
     """
+    return read_titles(path).names
+
+
+class Titles(NamedTuple):
+    """Names of the columns of a file, and the units that a row under the header gives them."""
+
+    names: list[str]
+    units: Mapping[str, str]
+
+
+def read_titles(path: Path) -> Titles:
+    """Return the columns (or variables) of a file that could be read, in order, and their units.
+
+    Raises:
+        InputError: no such file, an unknown ending, content that does not fit it.
+    """
     check_readable(path)
     ending, reader = path.suffix.lower(), _reader_of(path)
     with foreign(path):
         if isinstance(reader, _PackageReader):
-            return list(reader.read(path))
+            return Titles(list(reader.read(path)), {})
         if ending in ENDINGS:
-            return variable_names(path)
+            return Titles(variable_names(path), {})
         if ending == ".parquet":
             with parquet_file(path) as file:
-                return list(file.schema_arrow.names)
+                return Titles(list(file.schema_arrow.names), {})
         found: list[str] = []
         if ending == ".xlsx":
-            read_sheet(path, lambda header: found.extend(header) or [])
+            units = read_sheet(path, lambda header: found.extend(header) or [])[2]
         else:
-            found = layout(path).names
-    return [name for name in number_names(found) if name]
+            found, units = (own := layout(path)).names, own.units
+    return Titles([name for name in number_names(found) if name], _units_of(found, units))
+
+
+def _units_of(header: Sequence[str], units: Sequence[str]) -> dict[str, str]:
+    """Return the units by column."""
+    return {
+        name: unit for name, unit in zip(number_names(header), units, strict=False) if name and unit
+    }
 
 
 def reading_note(path: Path) -> str:
@@ -202,9 +228,9 @@ def _read_text(
         return "" if np.isnan(value) else str(value)
 
     filled = {name: _up_to_last(np.asarray(held[place[name]])) for name in columns}
-    return Table(
-        path, values, filled, header_line + 1, cell, time if time and dates is not None else ""
-    )
+    dated = time if time and dates is not None else ""
+    units = _units_of(header, found.units)
+    return Table(path, values, filled, header_line + 1, cell, dated, units)
 
 
 def _cells(
@@ -360,11 +386,13 @@ def parquet_file(path: Path) -> Iterator[Any]:
 
 def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
     """Return the first worksheet."""
+    names: list[str] = []
 
     def place(header: Sequence[str]) -> list[int]:
+        names.extend(header)
         return places(path, columns, header)
 
-    top, found = read_sheet(path, place)
+    top, found, units = read_sheet(path, place)
     cells = dict(zip(columns, found, strict=True))
     values = {
         name: np.array([as_number(cell) for cell in column]) for name, column in cells.items()
@@ -381,7 +409,8 @@ def _read_excel(path: Path, columns: Sequence[str], time: str | None) -> Table:
     if time and not np.isfinite(values[time]).any():
         dates = parse_dates(np.array(cells[time], dtype=object), f"{path}: column '{time}'")
     values |= {time: dates} if time and dates is not None else {}
-    return Table(path, values, filled, top + 1, cell, time if time and dates is not None else "")
+    dated = time if time and dates is not None else ""
+    return Table(path, values, filled, top + 1, cell, dated, _units_of(names, units))
 
 
 def _read_variables(path: Path, columns: Sequence[str], time: str | None) -> Table:

@@ -16,7 +16,6 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
-from orthaug.data.columns import quantum_of
 from orthaug.data.gaps import complete_record, filled_record, held_warnings, saturation_warnings
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
@@ -232,8 +231,8 @@ def _single_repeats(record: Record) -> list[Warning]:
         outputs = experiment.outputs
         if len(outputs) < _FEWEST or not np.isfinite(outputs).all():
             continue
-        same = (outputs[1:] == outputs[:-1]).all(axis=1)
-        same &= (experiment.inputs[1:] == experiment.inputs[:-1]).all(axis=1)
+        held = (experiment.inputs[1:] == experiment.inputs[:-1]).all(axis=1)
+        same = held & (outputs[1:] == outputs[:-1]).all(axis=1)
         spread = np.maximum(np.diff(outputs, axis=0).std(axis=0), 1e-300)
         # At rest a row repeats the one before, too
         moves = (np.abs(np.diff(outputs, axis=0)) > _MOVING * spread).any(axis=1)
@@ -243,8 +242,8 @@ def _single_repeats(record: Record) -> list[Warning]:
             for row in np.flatnonzero(same & beside[:-2] & beside[2:])
         ]
         every += int(same.sum())
-        quanta = [quantum_of(column) or 0.0 for column in outputs.T]
-        chance += len(outputs) * float(np.prod(np.minimum(np.array(quanta) / spread, 1.0)))
+        steps = np.array([_resolution(column) for column in outputs.T])
+        chance += int(held.sum()) * float(np.prod(np.minimum(steps / spread, 1.0)))
     if len(places) < _REPEATS or chance > _BY_CHANCE * len(places) or len(places) < every / 2:
         return []
     shown = "; ".join(places[:_NAMED])
@@ -255,6 +254,15 @@ def _single_repeats(record: Record) -> list[Warning]:
         "moves the parameters. Take these rows out of the file."
     )
     return [Warning("repeated_rows", text)]
+
+
+def _resolution(values: Vector) -> float:
+    """Return the smallest difference between two values: the step in which they are recorded.
+
+    In a long record even fine steps, such as those of four decimals, let rows repeat by chance.
+    """
+    levels = np.unique(values)
+    return float(np.diff(levels).min()) if len(levels) > 1 else 0.0
 
 
 def _frozen_warnings(record: Record) -> list[Warning]:

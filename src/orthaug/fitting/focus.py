@@ -328,11 +328,14 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Estimate:
         warnings.append(Warning(NOT_CONVERGED, _CUT_SHORT))
     if choosing.learns and not key[1]:
         rival = min((one for one in compared if one.learner), key=lambda one: one.error)
-        beginning = (
-            f"no learner is better in the free run on held-out rows ({rival.described}), so the "
-            "result is"
-        )
-        warnings.append(Warning("physics_alone", f"{beginning} {named[key].described}."))
+        beginning = f"no learner is better in the free run on held-out rows ({rival.described})"
+        if rival.error < named[key].error:
+            beginning = (
+                "the gain of a learner in the free run on held-out rows is not sure "
+                f"({rival.described})"
+            )
+        text_of_result = f"{beginning}, so the result is {named[key].described}."
+        warnings.append(Warning("physics_alone", text_of_result))
     if lost:
         text_of_runs = (
             "every free run diverges, over training or held-out rows: the model is for "

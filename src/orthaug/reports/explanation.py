@@ -79,7 +79,8 @@ def _term_lines(result: ExplainResult) -> list[str]:
     lines = table(rows, drop=["alone", "unit", "std"])
     for term in result.terms:
         if term.rivals:
-            lines.append(f"nearly as well instead of {term.expression}: {', '.join(term.rivals)}")
+            rivals = f"nearly as well instead of {term.expression}: {', '.join(term.rivals)}"
+            lines += fold([rivals])
     return lines
 
 

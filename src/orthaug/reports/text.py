@@ -11,6 +11,7 @@ import numpy as np
 from orthaug._base.errors import Warning
 from orthaug._base.lines import (
     INTERVAL_HEAD,
+    continued,
     cut,
     estimate_cells,
     estimate_rows,
@@ -146,7 +147,7 @@ def _shared_lines(shared: SharedResult) -> list[str]:
             ]
             for other in shared.alternatives
         ]
-        lines += [f"  {line}" for line in table([head, *rows])]
+        lines += [f"  {line}" for line in table(continued([head, *rows], indent=2))]
     return lines
 
 
