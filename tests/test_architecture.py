@@ -56,6 +56,7 @@ ENTRIES = {
     "commands.": "a command, or a part of the page, has a file of its own",
 }
 CONCEPTS = {
+    "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
     "physics.fmu": "a kind of source",
     "physics.fmu_instances": "the interface FMI, in both versions",

@@ -24,10 +24,8 @@ from .data import Detrend as Detrend
 from .data import Experiment as Experiment
 from .data import Fill as Fill
 from .data import Lags as Lags
-from .data import Limits as Limits
 from .data import Outliers as Outliers
 from .data import Record as Record
-from .data import Repeats as Repeats
 from .data import Resample as Resample
 from .data import open_frame as open_frame
 from .data import open_parquet as open_parquet
@@ -36,6 +34,8 @@ from .data import read_record as read_record
 from .data.preparation import Decimate as Decimate
 from .data.preparation import Highpass as Highpass
 from .data.preparation import Lowpass as Lowpass
+from .data.steps import Limits as Limits
+from .data.steps import Repeats as Repeats
 from .data.steps import Shift as Shift
 from .export import export as export
 from .export import numpy_step as numpy_step

@@ -8,7 +8,5 @@ from .record import Record as Record
 from .regressors import Lags as Lags
 from .steps import Detrend as Detrend
 from .steps import Fill as Fill
-from .steps import Limits as Limits
 from .steps import Outliers as Outliers
-from .steps import Repeats as Repeats
 from .steps import Resample as Resample

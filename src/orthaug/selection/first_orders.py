@@ -1,11 +1,4 @@
-"""Orders of a first linear model, judged by the free run on held-out rows.
-
-Least squares one step ahead is biased by noise on the outputs, most where a system is slow beside
-its sampling. Instruments mend it (Young and Jakeman 1979): the outputs of the free run in place of
-the measured ones, with all rows filtered by 1/A of the model before. That begins at least squares,
-and where light damping makes these useless, at the poles of a long model that is reduced (Kung
-1978).
-"""
+"""Orders of a first linear model, judged by the free run on held-out rows (`linear_runs`)."""
 
 from __future__ import annotations
 
@@ -16,23 +9,29 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix
 from orthaug.data.record import Experiment, Record
 from orthaug.data.sources import RecordSource, witness
+from orthaug.selection.linear_runs import (
+    FEW_ROWS,
+    FITTED,
+    MOST_LAGS,
+    RANK,
+    Poles,
+    best_free_run,
+    first_row_of,
+    free_run_of,
+    from_poles,
+    lag_rows_of,
+    reduced_poles,
+)
 from orthaug.selection.orders import Orders, correlated_delay
 
-_MOST = 4  # lags of a channel
-_LONG = 40  # lags of a long model, whose poles orders begin at
-_RESPONSE = 200  # rows of its impulse response
-_PER_COLUMN = 5  # rows that one of its coefficients needs
 LOOKED_AT = 40_000
 """Rows of a longer record that orders are found on, in windows spread over it."""
-FITTED = 0.7  # share of the rows that a candidate is fitted to
-_REFINED = 5  # times that instruments refine a fit, at most
 _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are taken
 # Free-run error over that from another first lag, up to which the lag that a test found is kept
 _BETTER = 1.2
-_RANK = 1e-9  # singular value over the largest
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
 _EXACT = 1e-4  # of the output's deviation: below, more lags follow the rounding
@@ -46,12 +45,10 @@ _RESTARTED = (300, 100, 30, 10)  # rows after which a run is started again where
 _DOUBTFUL = 0.1  # of the output's deviation: above, refinement begins at other poles, too
 _DYNAMIC = 0.25  # of the error without past outputs, below which runs with them are believed
 
-_TOGETHER = 8_000  # rows that outputs with each other's past are looked at on
 _COUPLED = 0.9  # of the error without it, below which the past of other outputs is believed
 _ROUNDS = 3  # times that instruments refine a fit of all outputs
 
 Pair: TypeAlias = tuple[int, int]
-_Poles: TypeAlias = dict[int, Vector]
 _Choice: TypeAlias = tuple[float, Orders, tuple[float, ...]]
 """The least error of all orders, the smallest orders near it, and their error of each output."""
 
@@ -104,8 +101,8 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     least = 0 if direct else 1
     chosen, restarted = _telling(record, excited, first_lags, least, ())
     if chosen is None or chosen[0] > _DOUBTFUL or restarted is not None:
-        few = witness(RecordSource(record, 0), _TOGETHER) if len(record) > _TOGETHER else record
-        poles = [_reduced_poles(few, j) for j in range(len(record.outputs))]
+        few = witness(RecordSource(record, 0), FEW_ROWS) if len(record) > FEW_ROWS else record
+        poles = [reduced_poles(few, j) for j in range(len(record.outputs))]
         other, after = None, None
         if all(poles):
             other, after = _telling(few, excited, first_lags, least, poles)
@@ -145,10 +142,10 @@ def _coupled(
     every = tuple((i, j) for i in range(ny) for j in range(ny) if i != j)
     if not every or not record.inputs:
         return (), chosen
-    if len(record) > _TOGETHER:
-        record = witness(RecordSource(record, 0), _TOGETHER)
+    if len(record) > FEW_ROWS:
+        record = witness(RecordSource(record, 0), FEW_ROWS)
     nk, tried = chosen[1].nk, []
-    for na, n in product(range(1, _MOST + 1), range(1, _MOST + 1)):
+    for na, n in product(range(1, MOST_LAGS + 1), range(1, MOST_LAGS + 1)):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
         errors = _errors_together(record, orders, every, length)
         if errors is not None:
@@ -173,7 +170,7 @@ def _errors_together(
     record: Record, orders: Orders, pairs: Sequence[Pair], length: int | None
 ) -> tuple[float, ...] | None:
     """Return the error of the free run of all outputs on the last rows, as `_errors`."""
-    first = _first_row(orders)
+    first = first_row_of(orders)
     usable = [e for e in record.experiments if len(e) > first + 1]
     if length is not None:
         usable = [piece for e in usable for piece in _cut(e, first, length)]
@@ -208,7 +205,7 @@ def _fit_together(
     Refined by instruments, the outputs of the free run, while that lowers its error there. None
     where the columns have not full rank.
     """
-    first = _first_row(orders)
+    first = first_row_of(orders)
     y = np.concatenate([e.outputs[first:] for e in experiments])[:cut]
     phi = np.concatenate([_rows_together(e, orders) for e in experiments])[:cut]
     kept = _columns_together(y.shape[1], orders, pairs)
@@ -220,7 +217,7 @@ def _fit_together(
         for j in range(y.shape[1]):
             own = kept[:, j]
             system = (z[:, own] / scale[own]).T @ (phi[:, own] / scale[own])
-            if not np.isfinite(system).all() or np.linalg.cond(system) > 1 / _RANK**2:
+            if not np.isfinite(system).all() or np.linalg.cond(system) > 1 / RANK**2:
                 return best
             right = (z[:, own] / scale[own]).T @ y[:, j]
             theta[own, j] = np.linalg.solve(system, right) / scale[own]
@@ -254,22 +251,22 @@ def _columns_together(ny: int, orders: Orders, pairs: Sequence[Pair]) -> Any:
 
 def _rows_together(e: Experiment, orders: Orders) -> Matrix:
     """Return the rows of the past of all outputs, lag by lag, of the inputs, and 1."""
-    first, ny = _first_row(orders), e.outputs.shape[1]
+    first, ny = first_row_of(orders), e.outputs.shape[1]
     count = len(e) - first
     past = [
         e.outputs[first - i : first - i + count, j]
         for i in range(1, orders.na + 1)
         for j in range(ny)
     ]
-    driven = _rows(e, 0, replace(orders, na=0), first)
+    driven = lag_rows_of(e, 0, replace(orders, na=0), first)
     return np.column_stack([*past, driven]) if past else driven
 
 
 def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
     """Return the free run of all outputs from their first measured rows on."""
-    first, ny = _first_row(orders), e.outputs.shape[1]
+    first, ny = first_row_of(orders), e.outputs.shape[1]
     past = orders.na * ny
-    driven = _rows(e, 0, replace(orders, na=0), first) @ theta[past:]
+    driven = lag_rows_of(e, 0, replace(orders, na=0), first) @ theta[past:]
     along = theta[:past].T.copy()
     state = e.outputs[first - orders.na : first][::-1].reshape(-1).copy()
     run = np.empty((len(driven), ny))
@@ -287,7 +284,7 @@ def _telling(
     excited: tuple[int, ...],
     first_lags: Sequence[tuple[int, ...]],
     least: int,
-    poles: Sequence[_Poles],
+    poles: Sequence[Poles],
 ) -> tuple[_Choice | None, int | None]:
     """Return the choice of the longest runs that follow the output, and after what they restart.
 
@@ -321,7 +318,7 @@ def _best_choice(
     first_lags: Sequence[tuple[int, ...]],
     length: int | None,
     least: int,
-    poles: Sequence[_Poles],
+    poles: Sequence[Poles],
 ) -> _Choice | None:
     """Return the smallest orders near the best, from the first lags that are clearly better."""
     chosen: _Choice | None = None
@@ -338,14 +335,16 @@ def _smallest(
     nk: tuple[int, ...],
     length: int | None,
     least_na: int,
-    poles: Sequence[_Poles],
+    poles: Sequence[Poles],
 ) -> _Choice | None:
     """Return the least error of all orders from these first lags on, and the smallest near it.
 
     The error of the smallest orders comes with them.
     """
     tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
-    for na, n in product(range(least_na, _MOST + 1), range(1, _MOST + 1) if record.inputs else [0]):
+    for na, n in product(
+        range(least_na, MOST_LAGS + 1), range(1, MOST_LAGS + 1) if record.inputs else [0]
+    ):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
         errors = _errors(record, orders, length, poles)
         if errors is not None and orders.size:
@@ -373,7 +372,7 @@ def first_significant_lag(record: Record, number: int) -> int | None:
     """
     record = _spread_windows(record)
     longest = max(map(len, record.experiments))
-    found, most = [], max(_MOST, min(MOST_DELAY, longest // _PER_DELAY))
+    found, most = [], max(MOST_LAGS, min(MOST_DELAY, longest // _PER_DELAY))
     long = tuple(e for e in record.experiments if len(e) > 2 * most)
     for j, output in enumerate(record.outputs if long else ()):
         one = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
@@ -391,16 +390,16 @@ def _tested_delay(record: Record, number: int, most: int) -> int | None:
 
     None where none is significant or the lags cannot be separated.
     """
-    orders = Orders(_MOST, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
-    phi = np.concatenate([_rows(e, 0, orders, most) for e in record.experiments])
+    orders = Orders(MOST_LAGS, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
+    phi = np.concatenate([lag_rows_of(e, 0, orders, most) for e in record.experiments])
     y = np.concatenate([e.outputs[most:, 0] for e in record.experiments])
     q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
-    if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / _RANK:
+    if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / RANK:
         return None
     theta = np.linalg.solve(r, q.T @ y)
     noise = float(np.linalg.norm(y - q @ (r @ theta))) / np.sqrt(len(y) - len(theta))
     std = noise * np.linalg.norm(np.linalg.inv(r), axis=1)
-    begin = _MOST + number * (most + 1)
+    begin = MOST_LAGS + number * (most + 1)
     lags = slice(begin, begin + most + 1)
     over = np.flatnonzero(np.abs(theta[lags]) > _SURE * np.maximum(std[lags], 1e-300))
     return int(over[0]) if len(over) else None
@@ -417,49 +416,8 @@ def _persistence(record: Record, number: int) -> int:
     return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
 
 
-def _reduced_poles(record: Record, j: int) -> _Poles:
-    """Return denominators of a long model of an output, reduced to few states, by their number.
-
-    The model of many lags, which noise on the output hardly biases, has an impulse response. The
-    states of its Hankel matrix that hold most of it have the poles (Kung 1978). None are returned
-    for too few rows, or where the model is not stable.
-    """
-    nu = len(record.inputs)
-    rows = int(FITTED * sum(max(len(e) - _LONG, 0) for e in record.experiments))
-    rows = min(rows, _TOGETHER)
-    long = min(_LONG, rows // (_PER_COLUMN * (1 + nu)))
-    if not nu or long < 2 * _MOST:
-        return {}
-    orders = Orders(long, (long,) * nu, (1,) * nu)
-    usable = [e for e in record.experiments if len(e) > long + 1]
-    phi = np.concatenate([_rows(e, j, orders, long) for e in usable])[:rows]
-    y = np.concatenate([e.outputs[long:, j] for e in usable])[:rows]
-    scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-    theta = np.linalg.lstsq(phi / scale, y, rcond=_RANK)[0] / scale
-    response = np.zeros((_RESPONSE, nu))
-    past, driven = theta[:long], theta[long:-1].reshape(nu, long)
-    for k in range(_RESPONSE):
-        before = response[max(k - long, 0) : k][::-1]
-        response[k] = past[: len(before)] @ before
-        response[k] += driven[:, k] if k < long else 0.0
-    if not np.isfinite(response).all() or np.abs(response).max() > 1 / _RANK:
-        return {}
-    half = _RESPONSE // 2
-    hankel = np.block([[response[i + k] for k in range(half)] for i in range(half)])
-    u, s, _ = np.linalg.svd(hankel, full_matrices=False)
-    found = {}
-    for n in range(1, _MOST + 1):
-        if s[n - 1] > _RANK * s[0]:
-            seen = u[:, :n] * np.sqrt(s[:n])
-            forward = np.linalg.lstsq(seen[:-1], seen[1:], rcond=None)[0]
-            taps = np.real(np.poly(np.linalg.eigvals(forward)))
-            if np.all(np.abs(np.roots(taps)) < 1):
-                found[n] = taps
-    return found
-
-
 def _errors(
-    record: Record, orders: Orders, length: int | None, poles: Sequence[_Poles] = ()
+    record: Record, orders: Orders, length: int | None, poles: Sequence[Poles] = ()
 ) -> tuple[float, ...] | None:
     """Return the error of the free run on the last rows for each output.
 
@@ -469,7 +427,7 @@ def _errors(
     Args:
         poles: of each output, denominators by their degree at which refinement begins, too.
     """
-    first = _first_row(orders)
+    first = first_row_of(orders)
     usable = [e for e in record.experiments if len(e) > first + 1]
     if length is not None:
         usable = [piece for e in usable for piece in _cut(e, first, length)]
@@ -479,189 +437,24 @@ def _errors(
         columns = orders.size + 1
         if cut < 2 * columns or rows - cut < 2:
             return None
-        phi = np.concatenate([_rows(e, j, orders, first) for e in usable])
+        phi = np.concatenate([lag_rows_of(e, j, orders, first) for e in usable])
         y = np.concatenate([e.outputs[first:, j] for e in usable])
         scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
-        theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=_RANK)
+        theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=RANK)
         if rank < columns:
             return None
         simulated = phi / scale @ theta
         if record.inputs:
             starts = [theta / scale]
             if poles and orders.na in poles[j]:
-                starts += _from_poles(usable, j, poles[j][orders.na], orders, first, cut)
-            simulated = _best_free_run(usable, j, starts, orders, first, cut)
+                starts += from_poles(usable, j, poles[j][orders.na], orders, first, cut)
+            simulated = best_free_run(usable, j, starts, orders, first, cut)
         with np.errstate(all="ignore"):  # one that is not stable overflows
             wrong = float(np.sqrt(np.mean((simulated[cut:] - y[cut:]) ** 2)))
         if not np.isfinite(wrong):
             return None
         found.append(wrong / max(float(y.std()), 1e-300))
     return tuple(found)
-
-
-def _from_poles(
-    experiments: list[Experiment], j: int, taps: Vector, orders: Orders, first: int, cut: int
-) -> list[Vector]:
-    """Return θ with these poles, whose free run from rest follows the output best; none without."""
-    from scipy.signal import lfilter
-
-    driven = np.concatenate(
-        [
-            lfilter([1.0], taps, _rows(e, j, orders, first)[:, orders.na :], axis=0)
-            for e in experiments
-        ]
-    )[:cut]
-    y = np.concatenate([e.outputs[first:, j] for e in experiments])[:cut]
-    scale = np.maximum(np.linalg.norm(driven, axis=0), 1e-300)
-    if not np.isfinite(driven).all():
-        return []
-    b = np.linalg.lstsq(driven / scale, y, rcond=_RANK)[0] / scale
-    return [np.concatenate([-taps[1:], b])]
-
-
-def _best_free_run(
-    experiments: list[Experiment],
-    j: int,
-    starts: Sequence[Vector],
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector:
-    """Return the free run that is best over the first `cut` rows, of some starts or refined."""
-    y = np.concatenate([e.outputs[first:, j] for e in experiments])
-    best, least = np.full(len(y), np.inf), np.inf
-    for theta in starts:
-        for refine in (_by_instruments, _by_descent)[: len(starts)]:
-            own = np.inf
-            for _ in range(1 + _REFINED):
-                runs = [_free_run(e, j, theta, orders, first) for e in experiments]
-                if len(starts) > 1:
-                    runs = _from_best_starts(runs, experiments, j, theta, orders, first, cut)
-                simulated = np.concatenate(runs)
-                with np.errstate(all="ignore"):
-                    square = float(np.mean((simulated[:cut] - y[:cut]) ** 2))
-                if not square < own:
-                    break
-                own, reached = square, theta
-                if own < least:
-                    best, least = simulated, own
-                refined = refine(experiments, runs, j, theta, orders, first, cut)
-                if refined is None:
-                    break
-                theta = refined
-            if not np.isfinite(own):
-                break
-            theta = reached
-    return best
-
-
-def _from_best_starts(
-    runs: list[Vector],
-    experiments: list[Experiment],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> list[Vector]:
-    """Return runs from the past by which they follow the first `cut` rows best.
-
-    What light damping makes of the noise in a measured start lasts for long.
-    """
-    from scipy.signal import lfilter
-
-    taps, begin, moved = np.concatenate([[1.0], -theta[: orders.na]]), 0, []
-    for run, e in zip(runs, experiments, strict=True):
-        rows, begin = min(len(run), max(cut - begin, 0)), begin + len(run)
-        if rows > 2 * orders.na and np.isfinite(run).all():
-            still = np.zeros(len(run))
-            free = np.stack(
-                [lfilter([1.0], taps, still, zi=zi)[0] for zi in np.eye(orders.na)], axis=1
-            )
-            left = e.outputs[first : first + rows, j] - run[:rows]
-            if np.isfinite(free).all():
-                run = run + free @ np.linalg.lstsq(free[:rows], left, rcond=None)[0]
-        moved.append(run)
-    return moved
-
-
-def _by_instruments(
-    experiments: list[Experiment],
-    runs: list[Vector],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector | None:
-    """Return θ with the outputs of free runs as instruments, rows filtered by 1/A.
-
-    None where A is not stable or the instruments do not determine θ.
-    """
-    instruments = _filtered(experiments, j, theta, orders, first, runs)
-    if instruments is None:
-        return None
-    measured = _filtered(experiments, j, theta, orders, first)
-    assert measured is not None
-    return _solved(*(part[:cut] for part in (instruments[0], *measured)))
-
-
-def _by_descent(
-    experiments: list[Experiment],
-    runs: list[Vector],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector | None:
-    """Return θ after a step of Gauss and Newton on the errors of the free runs.
-
-    Their slopes are the rows of the run, filtered by 1/A. None as of `_by_instruments`.
-    """
-    slopes = _filtered(experiments, j, theta, orders, first, runs)
-    if slopes is None:
-        return None
-    left = np.concatenate([e.outputs[first:, j] for e in experiments]) - np.concatenate(runs)
-    step = _solved(slopes[0][:cut], slopes[0][:cut], left[:cut])
-    return None if step is None else theta + step
-
-
-def _filtered(
-    experiments: list[Experiment],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    runs: list[Vector] | None = None,
-) -> tuple[Matrix, Vector] | None:
-    """Return rows and output filtered by 1/A, measured or of free runs.
-
-    None where A is unstable.
-    """
-    from scipy.signal import lfilter
-
-    taps = np.concatenate([[1.0], -theta[: orders.na]])
-    if not orders.na or np.any(np.abs(np.roots(taps)) >= 1):
-        return None
-    rows, target = [], []
-    for i, e in enumerate(experiments):
-        if runs is not None:
-            outputs = e.outputs.copy()
-            outputs[first:, j] = runs[i]
-            e = replace(e, outputs=outputs)
-        rows.append(lfilter([1.0], taps, _rows(e, j, orders, first), axis=0))
-        target.append(lfilter([1.0], taps, e.outputs[first:, j]))
-    return np.concatenate(rows), np.concatenate(target)
-
-
-def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
-    """Return θ by instruments; None where they do not determine it."""
-    scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    system = (instruments / scale).T @ (rows / scale)
-    if not np.isfinite(system).all() or not np.linalg.cond(system) < 1 / _RANK:
-        return None
-    return np.linalg.solve(system, (instruments / scale).T @ target) / scale
 
 
 def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[float, ...] | None:
@@ -672,7 +465,7 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
     bounds.
     """
     orders, found = model.orders, []
-    first = _first_row(orders)
+    first = first_row_of(orders)
     fitted, tested = ([e for e in r.experiments if len(e) > first] for r in (train, test))
     if not tested or not fitted:
         return None
@@ -687,11 +480,11 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
             errors = np.sqrt(np.mean((run - measured) ** 2, axis=0)) / measured.std(axis=0)
         return tuple(errors.tolist()) if np.isfinite(errors).all() else None
     for j in range(len(train.outputs)):
-        phi = np.concatenate([_rows(e, j, orders, first) for e in fitted])
+        phi = np.concatenate([lag_rows_of(e, j, orders, first) for e in fitted])
         y = np.concatenate([e.outputs[first:, j] for e in fitted])
         phi = phi if model.offset else phi[:, :-1]
         scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-        theta = np.linalg.lstsq(phi / scale, y, rcond=_RANK)[0] / scale
+        theta = np.linalg.lstsq(phi / scale, y, rcond=RANK)[0] / scale
         theta = theta if model.offset else np.append(theta, 0.0)
         runs = [_modelled(e, j, theta, orders, first, train) for e in tested]
         measured = np.concatenate([e.outputs[first:, j] for e in tested])
@@ -709,38 +502,10 @@ def _cut(e: Experiment, first: int, length: int) -> list[Experiment]:
     return [e.rows(begin, begin + length + first) for begin in begins]
 
 
-def _first_row(orders: Orders) -> int:
-    """Return the first row that has all its lags."""
-    late = (nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))
-    return max([orders.na, *late])
-
-
 def _modelled(
     e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int, record: Record
 ) -> np.ndarray:
     """Return the free run, or one step ahead where there are no inputs."""
     if record.inputs:
-        return _free_run(e, j, theta, orders, first)
-    return _rows(e, j, orders, first) @ theta
-
-
-def _rows(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
-    """Return the rows of own past, inputs from their delays on, and 1."""
-    count = len(e) - first
-    columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
-    for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
-        columns += [e.inputs[first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
-    return np.stack([*columns, np.ones(count)], axis=1)
-
-
-def _free_run(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int) -> np.ndarray:
-    """Return the output from its first measured rows on."""
-    from scipy.signal import lfilter, lfiltic
-
-    driven = _rows(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]
-    taps = np.concatenate([[1.0], -theta[: orders.na]])
-    with np.errstate(all="ignore"):
-        start = lfiltic(
-            [1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0)
-        )
-        return lfilter([1.0], taps, driven, zi=start)[0]
+        return free_run_of(e, j, theta, orders, first)
+    return lag_rows_of(e, j, orders, first) @ theta
