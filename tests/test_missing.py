@@ -309,7 +309,7 @@ def test_an_unknown_way_is_an_error(project):
     project.write_text(SPEC.replace('"skip"', '"drop"'), encoding="utf-8")
     done = run("fit", project)
     assert done.code == 2 and one_line(
-        done.err, "error: ", "'data.missing': found \"drop\"", "'error' or 'skip'"
+        done.err, "error: ", "'data.missing': found \"drop\"", "'error', 'skip' or 'keep'"
     )
 
 

@@ -158,9 +158,11 @@ def label(
 def outline(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve to draw; of a long one the extremes in every column of pixels.
 
-    It goes across rows without a value.
+    It goes across rows without a value, between others.
     """
-    if not (there := np.isfinite(values)).all():
+    there = np.isfinite(values)
+    ends = np.flatnonzero(there)[[0, -1]] if there.any() else (0, 0)
+    if not there[ends[0] : ends[1] + 1].all():
         time, values = time[there], values[there]
     if len(values) <= 4 * _COLUMNS:
         return time, values
