@@ -92,6 +92,11 @@ def answers(spec: Path) -> dict[str, Any]:
     return found
 
 
+def is_checksum(entry: Any) -> bool:
+    """Return whether it is the checksum of a model, which is that of its last bits."""
+    return isinstance(entry, str) and len(entry) == 64 and " " not in entry
+
+
 def lasting(value: Any) -> Any:
     """Return an answer without what is volatile, numbers with twelve digits, long lists as a few of them."""
     sizes = value.get("magnitude") if isinstance(value, dict) and "phase" in value else None
@@ -101,8 +106,8 @@ def lasting(value: Any) -> Any:
         return {
             name: lasting(entry)
             for name, entry in value.items()
-            if name not in VOLATILE and not (name == "model" and isinstance(entry, str))
-        }  # the checksum of a model is that of its last bits
+            if name not in VOLATILE and not (name == "model" and is_checksum(entry))
+        }
     if (
         isinstance(value, list)
         and len(value) > LONG

@@ -246,7 +246,10 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         return None
     doubted, others = doubted_equations(fit)
     found = _missing_in(fit, doubted)
-    if not others or found is None or (found.terms and found.terms[0].share > _ENOUGH):
+    if found is None:  # the rows are too few for all of these
+        states = [i for i in doubted if i < len(fit.problem.motion.states)]
+        return None if len(states) == len(doubted) else _missing_in(fit, states)
+    if not others or (found.terms and found.terms[0].share > _ENOUGH):
         return found
     beyond = _missing_in(fit, others)  # a sensor may bend what it measures
     if beyond is None or not beyond.terms or _is_a_shift(beyond.terms[0], fit.problem.motion):
