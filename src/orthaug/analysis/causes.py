@@ -248,7 +248,7 @@ def _weigh_causes(
     """
     causes = tuple(entries[0] for entries in each)
     bias = np.sum([cause.shift for cause in causes], axis=0)
-    unsure, rivals = [np.sqrt((1 - share) / share) * bias], []
+    unsure, rivals = [np.sqrt(max(1 - share, 0.0) / share) * bias], []
     for cause, *others in each:
         close = rivals_of(cause, (*others, *considered.alike))
         apart = [np.abs(rival.shift - cause.shift) for rival in close]
