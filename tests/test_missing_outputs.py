@@ -74,6 +74,7 @@ def test_the_estimate_is_that_of_the_measured_samples(every):
     }[every]
     y = np.where(lost, np.nan, y)
     record = oa.Record.from_arrays(u, y, sampling_time=STEP, missing="keep")
+    assert f"outputs: y ({lost.sum()} missing)" in repr(record)
     fit, values = fitted(record)
     np.testing.assert_allclose(values, by_scipy(u, [y])[:2], rtol=1e-6)
     measured = ~lost

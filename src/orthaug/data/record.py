@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -121,6 +121,11 @@ class Channel:
 
 def _quote(name: Any) -> str:
     return f"'{name}'" if isinstance(name, str) else show(name)
+
+
+def _counted(name: str, lost: Mapping[str, int]) -> str:
+    """Return a channel's name, with the number of its samples that are missing."""
+    return f"{name} ({lost[name]} missing)" if lost[name] else name
 
 
 def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
@@ -413,8 +418,11 @@ class Record(NotebookView):
 
     def __repr__(self) -> str:
         count = len(self.experiments)
+        lost = dict.fromkeys((channel.name for channel in self.channels), 0)
+        for channel, samples in zip(self.outputs, self.measured, strict=True):
+            lost[channel.name] = len(self) - len(samples)
         names = "; ".join(
-            f"{kind}: {', '.join(channel.name for channel in channels) or 'none'}"
+            f"{kind}: {', '.join(_counted(channel.name, lost) for channel in channels) or 'none'}"
             for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
         )
         plural = "s" if count != 1 else ""
