@@ -193,9 +193,10 @@ def _of_motion(
     if coarse is not None and coarse.whole:
         white, explained = True, False
     size = rms_errors(free_run) / fit.problem.deviation
+    looked = motion.inputs and motion.source is None  # physics of a file takes minutes for that
     late = (
         _late_inputs(fit)
-        if motion.inputs and (explained or not white) and np.any(size > _SIZABLE)
+        if looked and (explained or not white) and np.any(size > _SIZABLE)
         else ()
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
