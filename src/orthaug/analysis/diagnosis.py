@@ -195,9 +195,7 @@ def _of_motion(
     size = rms_errors(free_run) / fit.problem.deviation
     looked = motion.inputs and motion.source is None  # physics of a file takes minutes for that
     late = (
-        _late_inputs(fit)
-        if looked and (explained or not white) and np.any(size > _SIZABLE)
-        else ()
+        _late_inputs(fit) if looked and (explained or not white) and np.any(size > _SIZABLE) else ()
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = free_run_words(
