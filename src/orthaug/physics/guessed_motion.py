@@ -192,12 +192,15 @@ def guess(
     sampling_time: float,
 ) -> Float[np.ndarray, "r n0"]:
     """Return states at some rows, estimated from the outputs (N, ny) measured about them."""
-    rows, outputs = np.asarray(rows, dtype=int), without_gaps(outputs)
+    rows = np.asarray(rows, dtype=int)
     width = min(_ROWS, len(outputs))
     begin = np.clip(rows - width // 2, 0, len(outputs) - width)
     level = np.zeros((2, len(rows), outputs.shape[1]))
     if width:
-        there = outputs[begin[:, None] + np.arange(width)]
+        windows = begin[:, None] + np.arange(width)
+        there = outputs[windows]
+        if np.isnan(there).any():
+            there = without_gaps(outputs)[windows]
         fitted = _polynomials(width)[rows - begin] @ there  # (r, degree + 1, ny)
         level[: fitted.shape[1]] = np.moveaxis(fitted[:, :2], 1, 0)
     names = [output.name for output in motion.outputs]
