@@ -500,7 +500,7 @@ def _account(
     if roles.every > 1:
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
-            '[motion] would use all (missing = "keep")'
+            "[motion] can run through the others"
         )
     if roles.held:
         names = join_words(roles.held)

@@ -19,7 +19,7 @@ from orthaug._base.errors import InputError, MissingSampleError, show
 from orthaug._base.lines import plural
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
 from orthaug.data.layouts import MISSING, STATES, text_number
-from orthaug.data.preparation import check_steps, prepared_experiments
+from orthaug.data.preparation import MENDING, STEPS, check_steps, prepared_experiments
 from orthaug.data.record import (
     Channel,
     Experiment,
@@ -30,7 +30,7 @@ from orthaug.data.record import (
     steps_between,
     unbroken,
 )
-from orthaug.data.steps import Fill, Limits, Outliers, Repeats, Resample, Run
+from orthaug.data.steps import Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 
 RowRange = tuple[int, int] | list[int]
@@ -192,9 +192,8 @@ class _RawRanges:
     def prepare(self, steps: Sequence[Any], ranges: Sequence[tuple[int, int]]) -> Record:
         """Return the record after the steps."""
         check_steps(steps)
-        mends = self.missing != "error" or any(
-            isinstance(step, Outliers | Repeats | Limits | Fill) for step in steps
-        )
+        mending = tuple(STEPS[kind] for kind in MENDING)
+        mends = self.missing != "error" or any(isinstance(step, mending) for step in steps)
         uneven = any(isinstance(step, Resample) for step in steps)
         runs = [self._run(begin, end, mends=mends, uneven=uneven) for begin, end in ranges]
         experiments, step, done, lost = prepared_experiments(
@@ -451,7 +450,7 @@ def _remedy(text: str) -> str:
     if text.strip().lower() in STATES:
         return " Write 0 and 1 for such words."
     return (
-        ' Correct the cell, or empty it where its sample is missing: `missing` = "skip" in [data] '
+        ' Correct the cell, or empty it where its sample is missing: `missing` = "skip" '
         "in [data] leaves such rows out."
     )
 

@@ -105,15 +105,20 @@ def best_free_run(
     first: int,
     cut: int,
 ) -> Vector:
-    """Return the free run that is best over the first `cut` rows, of some starts or refined."""
+    """Return the free run that is best over the first `cut` rows, of some starts or refined.
+
+    Of several starts the steps of Gauss and Newton follow, and the past that a run begins at is
+    chosen, too.
+    """
+    thorough = len(starts) > 1
     y = np.concatenate([e.outputs[first:, j] for e in experiments])
     best, least = np.full(len(y), np.inf), np.inf
     for theta in starts:
-        for refine in (_by_instruments, _by_descent)[: len(starts)]:
+        for refine in (_by_instruments, _by_descent) if thorough else (_by_instruments,):
             own = np.inf
             for _ in range(1 + _REFINED):
                 runs = [free_run_of(e, j, theta, orders, first) for e in experiments]
-                if len(starts) > 1:
+                if thorough:
                     runs = _from_best_starts(runs, experiments, j, theta, orders, first, cut)
                 simulated = np.concatenate(runs)
                 with np.errstate(all="ignore"):
