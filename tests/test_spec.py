@@ -158,6 +158,20 @@ def test_defaults(tmp_path):
     assert (training.segment, training.washout) == ("auto", 40)
 
 
+@pytest.mark.parametrize(
+    ("train", "files"),
+    [
+        ('"a.csv"', ["a.csv"]),
+        ('["a.csv", "b.csv"]', ["a.csv", "b.csv"]),
+        ('{ files = "a.csv" }', ["a.csv"]),
+    ],
+)
+def test_a_part_may_be_the_name_of_its_file(tmp_path, train, files):
+    given = next(line for line in LEAST.splitlines() if line.startswith("train"))
+    spec = load_spec(put(tmp_path, edited(LEAST, given, f"train = {train}")))
+    assert spec.data.train.files == files
+
+
 def test_without_inputs_with_a_time_column_and_without_a_learner(tmp_path):
     text = (
         edited(LEAST, 'inputs = ["u"]', 'inputs = []\ntime = "t"')
@@ -312,9 +326,9 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ),
     (
         'files = ["run1.csv", "sub/run2.csv"]',
-        'files = "run1.csv"',
+        "files = true",
         "data.train.files",
-        '"run1.csv"',
+        "true",
         "list",
     ),
     (
@@ -442,8 +456,7 @@ def test_wrong_values(tmp_path, old, new, key, found, expected):
 
 
 TABLES = [
-    ('train = { files = ["run.csv"] }', 'train = ["run.csv"]', "data.train"),
-    ('train = { files = ["run.csv"] }', 'train = "run.csv"', "data.train"),
+    ('train = { files = ["run.csv"] }', "train = true", "data.train"),
     ("[[baseline.terms]]", "[baseline.terms]", "baseline.terms"),
 ]
 

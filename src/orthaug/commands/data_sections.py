@@ -54,6 +54,16 @@ class PartSection(Section):
     skip: Count = 0
     columns: dict[str, str] = {}
 
+    @model_validator(mode="before")
+    @classmethod
+    def _files_alone(cls, given: Any) -> Any:
+        """Read a file's name, or a list of names, as the table that has nothing else."""
+        if isinstance(given, str | list):
+            given = {"files": given}
+        if isinstance(given, dict) and isinstance(given.get("files"), str):
+            given = given | {"files": [given["files"]]}
+        return given
+
 
 class ChannelSection(Section):
     """A channel in files: value = scale * cell + offset of column."""
