@@ -75,6 +75,8 @@ def steps(seed: int) -> np.ndarray:
 def spring(seed: int, noise: str, hidden: str) -> tuple[np.ndarray, np.ndarray]:
     """m x'' = u − c x' − k x − h with m, c, k = 1, 0.6, 4, by Runge-Kutta steps of a fifth of a sample."""
     random, u = np.random.default_rng([seed, 2]), steps(seed)
+    if hidden == "heat":  # bursts of unequal size, each of about the time constant of what heats up
+        u = u * np.repeat(random.uniform(0.3, 2, ROWS // 100 + 1), 100)[:ROWS]
     size = 0.3 if noise == "equation" else 0.0
     force = u + size * random.normal(size=ROWS)
     state, y, h = np.zeros(3), [], TS / 5
@@ -90,6 +92,8 @@ def spring(seed: int, noise: str, hidden: str) -> tuple[np.ndarray, np.ndarray]:
             gap = x - z
             pull = 2 * z
             follows = v if (gap >= 0.3 and v > 0) or (gap <= -0.3 and v < 0) else 0.0
+        elif hidden == "heat":  # a rubber spring that softens with the power of its force
+            pull, follows = -2 * z / (1 + z) * x, (f**2 / 4 - z) / (100 * TS)
         return np.array([v, f - 0.6 * v - 4 * x - pull, follows])
 
     for f in force:
@@ -121,6 +125,7 @@ SYSTEMS: dict[
     "motion, right physics": (spring, "", MOTION, "k", 4.0, "v"),
     "motion, backlash": (spring, "backlash", MOTION, "k", 4.0, "v"),
     "motion, Bouc-Wen": (spring, "bouc_wen", MOTION, "k", 4.0, "v"),
+    "motion, a spring that heats up": (spring, "heat", MOTION, "k", 4.0, "v"),
     "lagged, hidden lag": (lagged, "lag", LAGGED, "a1", 1.35, "y[k-1] - y[k-2]"),
     "lagged, right physics": (lagged, "", LAGGED, "a1", 1.35, "y[k-1] - y[k-2]"),
 }

@@ -291,6 +291,43 @@ def stepped(rows: int, seed: int, held: int = 12) -> np.ndarray:
     return np.repeat(np.random.default_rng(seed).uniform(-1, 1, rows // held + 1), held)[:rows]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", ["sensor", "equation"])
+@pytest.mark.parametrize("heats", [0.5, 0.0])
+def test_a_resistance_that_follows_the_heat_of_its_current_is_a_hidden_state(noise, heats):
+    """A coil at bursts of unequal size; the state of its heat is in no catalogue of terms."""
+    random = np.random.default_rng([7, noise == "sensor"])
+    u = stepped(2000, 5, 8) * np.repeat(random.uniform(0.2, 2, 10), 200)
+    i, heat, y, resistance = 0.0, 0.5, [], []
+    for value in u:
+        y.append(i)
+        resistance.append(0.8 + heats * heat)
+        heat += 0.05 * (i**2 - heat) / 4
+        shock = 0.02 * random.normal() if noise == "equation" else 0.0
+        i += 0.05 * (value - (0.8 + heats * heat) * i) / 0.5 + shock
+    motion = oa.Motion.from_equations(
+        [oa.State("i", "(u - R*i)/L", start="y")],
+        [oa.Output("y", "i")],
+        [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 0.4, min=0)],
+        ["u"],
+        hold="zero-order",
+    )
+    measured = np.array(y) + (5e-3 if noise == "sensor" else 0.0) * random.normal(size=2000)
+    record = oa.Record.from_arrays(u, measured, sampling_time=0.05)
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    said = {w.code: w.text for w in found.warnings}
+    if not heats:
+        assert not {"hidden_state", "parameter_drift", "unexplained"} & said.keys()
+        return
+    text = said["hidden_state"]
+    assert text.startswith("a state is missing that changes R") and "**2" in text
+    low, high = (float(text.split(f" {word} ")[1].split(" ")[0]) for word in ("from", "to"))
+    # to first order, and about a mean: between the ends, and over half of the way
+    assert 0.95 * min(resistance) < low < high < 1.05 * max(resistance)
+    assert high - low > np.ptp(resistance) / 2
+    assert [row.ci95_counts for row in found.parameters] == ["noise only", "noise only"]
+
+
 def test_a_parameter_that_changes_over_the_record_is_named_with_both_ends():
     """A coil that warms up: its resistance rises by a half; under a constant one nothing is said."""
     said = {}

@@ -20,7 +20,9 @@ from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResul
 from orthaug.analysis.fit_findings import Findings, ParameterResult
 
 if TYPE_CHECKING:
-    from orthaug.analysis.hidden_state import FamilyTest, ParameterDrift, StructureTest
+    from orthaug.analysis.family_tests import FamilyTest
+    from orthaug.analysis.hidden_state import StructureTest
+    from orthaug.analysis.parameter_changes import ParameterDrift
 
 E = TypeVar("E", bound=Any)
 """An `Examination`."""
@@ -28,7 +30,7 @@ E = TypeVar("E", bound=Any)
 _LISTED = 3  # parameters, and terms with memory
 NOISE_ONLY = (
     *("unexplained", "parameter_drift", "quantised_output", "explains_nothing"),
-    *("few_frequencies", "little_left", "output_without_learner"),
+    *("few_frequencies", "little_left", "output_without_learner", "hidden_state"),
 )
 """Codes of warnings that leave intervals of noise alone."""
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
@@ -238,7 +240,8 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     )
     return (
         f"a state is missing: {best.name} in {best.equation} predicts {percent(best.share)} of "
-        f"the free run's error on held-out rows{beside}. No function of the model's own states "
+        f"the free run's error on held-out rows{beside}, beyond what its own past predicts. No "
+        f"function of the model's own states "
         f"predicts it.{_movement_text(fit, best)}{noisy} Remedy: {remedy}."
     )
 
@@ -255,12 +258,22 @@ def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
     ]
     if not np.isfinite(ends).all():
         return []
+    beyond = "on held-out rows, beyond what its own past explains"
+    share = f"which explains {percent(drift.share)} of the free run's error {beyond}"
+    if drift.follows is not None:
+        what = drift.follows
+        text = (
+            f"a state is missing that changes {name}: with a {what.name}, {name} goes from "
+            f"{ends[0]:.3g} where it is smallest to {ends[1]:.3g} where it is largest, {share}. A "
+            "part that heats up acts so. Its value here is a mean. Remedy: a motion with that "
+            f"state, dz/dt = ({what.on} - z)/{what.scale:.3g}, and {name} as a function of z."
+        )
+        return [Warning("hidden_state", text)]
     text = (
         f"{name} seems to change over the record: from {ends[0]:.3g} at its begin to {ends[1]:.3g} "
-        f"at its end, which explains {percent(drift.share)} of the free run's error on held-out "
-        "rows. Its value is a mean, and its interval is that of a constant. Record what it depends "
-        "on, such as a temperature, and write that into the physics; or fit the begin and the end "
-        "on their own."
+        f"at its end, {share}. Its value is a mean, and its interval is that of a constant. Record "
+        "what it depends on, such as a temperature, and write that into the physics; or fit the "
+        "begin and the end on their own."
     )
     return [Warning("parameter_drift", text)]
 

@@ -4,10 +4,7 @@ The errors of the free run are regressed on how the outputs follow, to first ord
 the starts and any function of what a learner sees (`output_response`). What is added to that are
 simple functions of a state or an input, and terms with memory of it (`memory`). Run and inputs are
 no function of the noise: noise of any colour, on the sensor or in the equation, is no reason to
-find one. Rows and columns are filtered by the autoregression of the errors beside the model
-(Cochrane and Orcutt 1949), so that what remains of noise is white. A family of terms counts where
-its F-test rejects at the level divided by the number of families and it predicts blocks of rows
-that it was not fitted to.
+find one (`family_tests`).
 """
 
 from __future__ import annotations
@@ -17,10 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.columns import least_squares, span
+from orthaug._base.columns import span
+from orthaug.analysis.family_tests import STATIC, Candidates, Family, FamilyTest, best_family
 from orthaug.analysis.filtered_rows import (
     RANK,
     error_colours,
@@ -28,9 +25,14 @@ from orthaug.analysis.filtered_rows import (
     filter_rows,
     stacked_rows,
 )
-from orthaug.analysis.memory import KINDS, MemoryTerm, memory_terms
+from orthaug.analysis.memory import KINDS, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
-from orthaug.analysis.predictability import BlockSums, Share
+from orthaug.analysis.parameter_changes import (
+    CLEARLY,
+    ParameterDrift,
+    changing_columns,
+    find_change,
+)
 from orthaug.data.record import Record
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.model import Model
@@ -38,73 +40,19 @@ from orthaug.models.moving import MotionDynamics
 
 _MOST_ROWS = 6000
 _VARIABLES, _EQUATIONS = 6, 3  # looked at, at most
-_LEVEL = 0.01
-_ROWS_PER_COLUMN = 4
 _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding and the integrator's
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 # Quantiles about which a function of a learner's feature bends
 _CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
-_STATIC, _DRIFT = 5, "drift"
+_STATIC = 5  # functions of one row
 _MULTIPLIED = 8  # features, of which products of pairs are taken
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
-# Of the filtered errors' square, by which memory predicts more than functions of one row
-_CLEARLY = 0.1
 _MUCH = 1.5  # times what functions of one row predict, with which memory is the cause beside them
 _NEARLY = 0.8  # of the best family's share
 # Error of the run over the outputs' deviation, from which on the run's states are not the system's
 _FAR = 0.5
 # Steps, shorter ones, and the fall of the squares that ends them
 _SETTLING, _HALVINGS, _SETTLED = (8, 4, 0.01)
-
-
-@dataclass(frozen=True)
-class FamilyTest:
-    """A family of terms in one equation, and the `share` of the errors that it predicts.
-
-    The share is of the filtered errors' square, on held-out blocks.
-
-    `error` is the standard error of the share, `p` that of the F-test, times the number of
-    families. `moves` is by how much each parameter moves once the best `term` is fitted beside it,
-    in the coordinates that are estimated.
-    """
-
-    equation: str
-    on: str
-    kind: str
-    share: float
-    error: float
-    p: float
-    term: MemoryTerm | None = None
-    moves: tuple[float, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Name of the family, in words."""
-        return f"a function of {self.on}" if self.term is None else f"a {self.term.name}"
-
-    def is_short(self, least: float) -> bool:
-        """Return whether it is a lag of a time constant below a least one, in s."""
-        return self.kind == "lag" and self.term is not None and self.term.scale < least
-
-    @property
-    def sure(self) -> bool:
-        """True if the family is surely present."""
-        return self.p < _LEVEL and self.share > 2 * self.error
-
-
-@dataclass(frozen=True)
-class ParameterDrift:
-    """A parameter, by its place, that seems to change over the record.
-
-    `share` of the errors is what a curve of the second degree over time predicts; `begin` and
-    `end` are by how much its value there differs from the model's, in the coordinate that is
-    estimated.
-    """
-
-    place: int
-    share: float
-    begin: float
-    end: float
 
 
 @dataclass(frozen=True)
@@ -137,7 +85,10 @@ class StructureTest:
         return self.static is not None or self.memory is not None
 
     drift: ParameterDrift | None = None
-    """The parameter that changes over the record, if that predicts more than any term."""
+    """The parameter that changes over the record, if that predicts more than any term.
+
+    Where it follows the square of a signal, a state is missing that changes the parameter.
+    """
     delayed: tuple[str, ...] = ()
     """Signals whose short memory is a lag or a delay that is missing, and no state."""
 
@@ -173,20 +124,12 @@ class StructureTest:
             return False
         if self.state is self.memory and self.is_a_lag(self.hidden):
             return False
-        return self.static is None or self.state.share >= self.static.share + _CLEARLY
+        return self.static is None or self.state.share >= self.static.share + CLEARLY
 
     def exceeds(self, share: float) -> bool:
         """Return whether memory predicts much more than functions of one row, and than a share."""
         static = 0.0 if self.static is None else self.static.share
         return self.state is not None and self.state.share > _MUCH * max(static, share)
-
-
-@dataclass(frozen=True)
-class _Family:
-    equation: str
-    on: str
-    kind: str
-    terms: tuple[MemoryTerm | None, ...]
 
 
 def structure_test(model: Model, record: Record) -> StructureTest | None:
@@ -204,7 +147,8 @@ def structure_test(model: Model, record: Record) -> StructureTest | None:
     if np.all(whole.std(axis=0) < _ROUNDING * model.deviation):
         return None
     moved = theta - np.asarray(model.numbers.theta)
-    found = _test_families(runs, _base_columns(model, runs), *_added_columns(model, runs), moved)
+    own = _base_columns(model, runs)
+    found = _structure_of(Candidates(runs, own, *_added_columns(model, runs), moved))
     if found is None:
         return None
     delayed = tuple(_equations(model).delayed(runs[0]))
@@ -470,7 +414,7 @@ def _static(values: Vector, size: float) -> list[Vector]:
     return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
 
 
-def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[_Family], list[np.ndarray]]:
+def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[Family], list[np.ndarray]]:
     """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
     step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
@@ -479,129 +423,33 @@ def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[_Family], 
         joined = np.concatenate([own[name] for own in signals])
         size = float(np.sqrt(np.mean(joined**2))) or 1.0
         terms = memory_terms(name, joined, step)
-        kinds = [("static", (None,) * _STATIC)]
+        kinds = [(STATIC, (None,) * _STATIC)]
         kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
         for place, equation in _equations(model).doubted:
-            families += [_Family(equation, name, kind, own) for kind, own in kinds]
+            families += [Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, signals, runs, strict=True):
                 values = _static(own[name], size) + [
                     term.along(own[name], step) / size for term in terms
                 ]
                 found.append(_respond(model, run, place, np.stack(values, axis=1)))
-    # How the outputs follow a parameter that changes slowly, against what they remember
-    rows = sum(len(run.error) for run in runs)
-    over_time = np.split(np.linspace(-1, 1, rows), np.cumsum([len(run.error) for run in runs])[:-1])
-    for i in range(len(model.numbers.theta)):
-        families.append(_Family("", str(i), _DRIFT, (None, None)))
-        for found, run, t in zip(columns, runs, over_time, strict=True):
-            moved = run.parameters()[..., i]
-            found.append(np.stack([moved * power[:, None] for power in (t, t**2)], axis=2))
+    changing, moved = changing_columns(model, runs, names, signals)
+    families += changing
+    for found, own in zip(columns, moved, strict=True):
+        found += own
     return families, [np.concatenate(found, axis=2) for found in columns]
 
 
-def _test_families(
-    runs: list[LinearRun],
-    base: list[np.ndarray],
-    families: list[_Family],
-    added: list[np.ndarray],
-    shift: Vector,
-) -> StructureTest | None:
-    """Filter rows and columns by the colour of the remaining errors, and test every family."""
-    nt, known, colours = len(shift), base[0].shape[2], error_colours(runs, base)[1]
-    both = [np.concatenate(columns, axis=2) for columns in zip(base, added, strict=True)]
-    whole = np.concatenate(
-        [filter_rows(piece, colours) for piece in stacked_rows(runs, both, error_scale(runs))]
-    )
-    if len(whole) < _ROWS_PER_COLUMN * (known + len(families)) or not np.isfinite(whole).all():
+def _structure_of(candidates: Candidates) -> StructureTest | None:
+    """Return the best of all families, each beside what the model has."""
+    tests = candidates.test()
+    if tests is None:
         return None
-    starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
-    q = span(whole[:, starts], RANK)
-    # They move a few rows of one run only: blocks would not show them
-    whole = whole - q @ (q.T @ whole)
-    whole[:, starts] = 0.0
-    size = np.linalg.norm(whole, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    whole = whole / size
-    static = np.concatenate(
-        [np.full(len(family.terms), family.kind == "static") for family in families]
-    )
-    own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
-    beside = _family_tests(whole, own, known, families, size, shift)
-    hidden = _family_tests(whole, own + simple, known, families, size, None)
-    memory = [entry for entry in beside if entry.kind in KINDS]
+    memory = [entry for entry in tests.beside if entry.kind in KINDS]
+    static = best_family([entry for entry in tests.beside if entry.kind == STATIC])
     found = StructureTest(
-        _best_family([entry for entry in beside if entry.kind == "static"]),
-        _best_family(memory),
-        _best_family([entry for entry in hidden if entry.kind in KINDS]),
+        static,
+        best_family(memory),
+        best_family([entry for entry in tests.hidden if entry.kind in KINDS]),
         tuple(sorted(memory, key=lambda entry: -entry.share)),
     )
-    drift = _best_family([entry for entry in beside if entry.kind == _DRIFT])
-    others = [one.share for one in (found.static, found.memory) if one is not None]
-    if drift is None or drift.share < max(others, default=0.0):
-        return found
-    return replace(found, drift=_drift_of(whole, own, size, shift, drift))
-
-
-def _drift_of(
-    whole: Matrix, own: list[int], size: Vector, shift: Vector, best: FamilyTest
-) -> ParameterDrift:
-    """Return how far the parameter of a family is from the model's at either end of the record."""
-    place, powers = int(best.on), 2  # the columns of all parameters come last, before the errors
-    first = whole.shape[1] - 1 - powers * (len(shift) - place)
-    taken = [*own, first, first + 1]
-    steps = least_squares(whole[:, taken], whole[:, -1]) * size[-1] / size[taken]
-    middle, (linear, square) = shift[place] + steps[place], steps[-powers:]
-    return ParameterDrift(
-        place, best.share, float(middle - linear + square), float(middle + linear + square)
-    )
-
-
-def _best_family(entries: list[FamilyTest]) -> FamilyTest | None:
-    return max(
-        (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
-    )
-
-
-def _family_tests(
-    whole: Matrix,
-    base: list[int],
-    known: int,
-    families: list[_Family],
-    size: Vector,
-    shift: Vector | None,
-) -> list[FamilyTest]:
-    """Test every family beside the columns of a base.
-
-    `size` are the norms that columns were divided by.
-    """
-    q = span(whole[:, base], RANK)
-    rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
-    target, terms = rest[:, -1], rest[:, :-1]
-    total, left = float(target @ target), len(whole) - q.shape[1]
-    sums = BlockSums.of(np.concatenate([q, terms], axis=1), whole[:, -1])
-    blocks, found, place = list(range(q.shape[1])), [], 0
-    for family in families:
-        own = list(range(place, place + len(family.terms)))
-        place += len(family.terms)
-        own = [j for j in own if np.linalg.norm(terms[:, j]) > _OWN]
-        if not own or not total > 0:
-            continue
-        basis = span(terms[:, own], RANK)
-        gained, rank = float(np.sum((basis.T @ target) ** 2)), basis.shape[1]
-        freedom = left - rank
-        p = scipy.special.fdtrc(
-            rank, freedom, gained / rank / (max(total - gained, 1e-300) / freedom)
-        )
-        share: Share = sums.share([len(blocks) + j for j in own], blocks)
-        chosen = max(own, key=lambda j: (terms[:, j] @ target) ** 2 / (terms[:, j] @ terms[:, j]))
-        term = family.terms[chosen - (place - len(family.terms))]
-        entry = FamilyTest(
-            family.equation, family.on, family.kind, share.value, share.error, float(p), term
-        )
-        if shift is not None and term is not None:
-            step = least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
-            entry = replace(
-                entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)]))
-            )
-        found.append(entry)
-    return [replace(entry, p=min(entry.p * len(found), 1.0)) for entry in found]
+    return replace(found, drift=find_change(candidates, tests, [static, found.memory]))

@@ -68,8 +68,18 @@ class LinearRun:
 
     def parameters(self) -> Float[np.ndarray, "T ny nt"]:
         """Compute how the outputs follow the parameters of the physics."""
+        return self.changes(np.ones((len(self.error), 1)))[..., 0]
+
+    def changes(self, over_time: Matrix) -> Float[np.ndarray, "T ny nt k"]:
+        """Compute how the outputs follow parameters that change by k signals (T, k) over time."""
         n0, nt = self.theta_to_state.shape[1:]
-        return self.respond(self.theta_to_state, self.theta_to_output, np.zeros((n0, nt)))
+        k = over_time.shape[1]
+        into_state, into_output = (
+            (one[..., None] * over_time[:, None, None]).reshape(*one.shape[:2], nt * k)
+            for one in (self.theta_to_state, self.theta_to_output)
+        )
+        found = self.respond(into_state, into_output, np.zeros((n0, nt * k)))
+        return found.reshape(*found.shape[:2], nt, k)
 
 
 def linear_runs(model: Model, record: Record, most: int, theta: Vector) -> list[LinearRun] | None:

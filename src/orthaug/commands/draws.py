@@ -35,7 +35,7 @@ _WIDEST = 3.0  # of the recorded range of an output: what leaves that is another
 _HALVINGS = 8  # of a term that makes the run leave all bounds
 _ONE_START = {"training.restarts": 1}  # of other choices, which are many
 # Of these a text does not name all parameters that it doubts
-_DOUBTS = frozenset({*NOISE_ONLY, "hidden_state", "inconsistent", "sensor_noise"})
+_DOUBTS = frozenset({*NOISE_ONLY, "inconsistent", "sensor_noise"})
 _ANSWERED = frozenset({"biased"})  # with an interval of its own, which then has to hold the truth
 
 

@@ -1,0 +1,173 @@
+"""Parameters that change over a record: along a curve of time, or with the past of a signal.
+
+A part that heats up, wears or empties changes what the physics calls a constant. To first order the
+outputs follow such a parameter as they follow the parameter itself, times what it follows; these
+are families of terms beside all others (`family_tests`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import least_squares
+from orthaug.analysis.family_tests import Candidates, Family, FamilyTest, Tests, best_family
+from orthaug.analysis.memory import MemoryTerm
+from orthaug.analysis.output_response import LinearRun
+from orthaug.models.model import Model
+
+CLEARLY = 0.1
+"""Share by which one cause predicts clearly more than another."""
+
+_DRIFT, _SCHEDULED = "drift", "scheduled"
+# Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
+_SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
+_LIKELY = 0.5  # p with which a family is worth a second look
+
+
+@dataclass(frozen=True)
+class ParameterDrift:
+    """A parameter, by its place, that seems to change over the record.
+
+    `share` of the errors is what its change predicts: a curve of the second degree over time, or a
+    multiple of the slow lag `follows` of a signal's square, as of a gain that falls as its device
+    heats up. `begin` and `end` are by how much its value at either end of the record, or where
+    that lag is smallest and largest, differs from the model's, in the coordinate that is
+    estimated.
+    """
+
+    place: int
+    share: float
+    begin: float
+    end: float
+    follows: MemoryTerm | None = None
+
+
+def changing_columns(
+    model: Model, runs: list[LinearRun], names: list[str], signals: list[dict[str, Vector]]
+) -> tuple[list[Family], list[list[np.ndarray]]]:
+    """Return families of parameters that change over time, and the responses of every run.
+
+    Args:
+        names: of the signals whose past parameters may follow.
+        signals: of every run, by name.
+    """
+    count, step = len(model.numbers.theta), model.sampling_time
+    both = _scheduled_columns(count, step, runs, names, signals), _drift_columns(count, runs)
+    families = [family for found, _ in both for family in found]
+    return families, [a + b for a, b in zip(both[0][1], both[1][1], strict=True)]
+
+
+def _scheduled_columns(
+    count: int,
+    step: float,
+    runs: list[LinearRun],
+    names: list[str],
+    signals: list[dict[str, Vector]],
+) -> tuple[list[Family], list[list[np.ndarray]]]:
+    """Return families of parameters that follow slow lags of a signal's square, and responses.
+
+    The lag begins at the mean, as that of a device that has run before the record. None in records
+    too short to show it.
+    """
+    rows = sum(len(run.error) for run in runs)
+    families, columns = [], [[] for _ in runs]
+    constants = [steps for steps in _SLOW if rows >= _SLOW_ROWS and steps <= rows / 10]
+    for name in names if constants else ():
+        mean = float(np.mean(np.concatenate([own[name] for own in signals]) ** 2))
+        square = f"{name}**2" if " " not in name else f"({name})**2"
+        terms = tuple(MemoryTerm("lag", square, steps * step) for steps in constants)
+        lags = [
+            np.stack([term.along(np.append(mean, own[name] ** 2), step)[1:] for term in terms])
+            - mean
+            for own in signals
+        ]
+        joined = np.concatenate(lags, axis=1)
+        ranges = tuple(zip(joined.min(axis=1), joined.max(axis=1), strict=True))
+        families += [Family("", str(i), _SCHEDULED, terms, ranges) for i in range(count)]
+        for found, run, lag in zip(columns, runs, lags, strict=True):
+            found.append(_changes(run, lag.T))
+    return families, columns
+
+
+def _drift_columns(
+    count: int, runs: list[LinearRun]
+) -> tuple[list[Family], list[list[np.ndarray]]]:
+    """Return families of parameters that are curves of the second degree, and responses."""
+    rows = [len(run.error) for run in runs]
+    over_time = np.split(np.linspace(-1, 1, sum(rows)), np.cumsum(rows)[:-1])
+    families = [Family("", str(i), _DRIFT, (None, None)) for i in range(count)]
+    pairs = zip(runs, over_time, strict=True)
+    return families, [[_changes(run, np.stack([t, t**2], axis=1))] for run, t in pairs]
+
+
+def _changes(run: LinearRun, over_time: Matrix) -> np.ndarray:
+    """Return the responses to all parameters, each changed by all k signals (T, k) in turn."""
+    moved = run.changes(over_time)
+    return moved.reshape(*moved.shape[:2], -1)
+
+
+def find_change(
+    candidates: Candidates, tests: Tests, others: list[FamilyTest | None]
+) -> ParameterDrift | None:
+    """Return the change of a parameter that predicts more than all other terms; None without one.
+
+    Args:
+        candidates: what was tested, changing parameters among it.
+        tests: their tests.
+        others: the best terms of other kinds.
+    """
+    drift = best_family([one for one in tests.beside if one.kind == _DRIFT])
+    slow = _best_scheduled(tests)
+    if slow is None and (likely := _likely_scheduled(tests)) is not None:
+        # A slow change colours the errors: filtered by that colour hardly anything of it is left
+        tests = candidates.test(likely) or tests
+        slow = _best_scheduled(tests)
+    shares = [one.share for one in (*others, drift) if one is not None]
+    if slow is not None and slow.share > (1 + CLEARLY) * max(shares, default=0.0):
+        drift = slow
+    if drift is None or drift.share < max(shares, default=0.0):
+        return None
+    return _change_of(candidates, tests, drift)
+
+
+def _best_scheduled(tests: Tests) -> FamilyTest | None:
+    """Return the family of a parameter that surely follows a signal.
+
+    It is sure beside all terms of one row, too, which grow with the signal as well.
+    """
+    surely = {_scheduled_by(one) for one in tests.hidden if one.kind == _SCHEDULED and one.sure}
+    return best_family(
+        [one for one in tests.beside if one.kind == _SCHEDULED and _scheduled_by(one) in surely]
+    )
+
+
+def _likely_scheduled(tests: Tests) -> FamilyTest | None:
+    """Return the family of a parameter that most likely follows a signal; None if by chance."""
+    scheduled = [one for one in tests.beside if one.kind == _SCHEDULED and one.p < _LIKELY]
+    return max(scheduled, key=lambda one: one.share, default=None)
+
+
+def _scheduled_by(one: FamilyTest) -> tuple[str, str]:
+    """Return the parameter and the signal of a family."""
+    assert one.term is not None
+    return one.on, one.term.on
+
+
+def _change_of(candidates: Candidates, tests: Tests, best: FamilyTest) -> ParameterDrift:
+    """Return how far the parameter of a family is from the model's at either end of its change."""
+    at, place, whole = candidates.places_of(best), int(best.on), tests.rows
+    family = next(one for one in candidates.families if one.is_of(best))
+    chosen = [0, 1] if best.term is None else [family.terms.index(best.term)]
+    taken = [*range(tests.known), *(tests.known + at[j] for j in chosen)]
+    steps = least_squares(whole[:, taken], whole[:, -1]) * tests.size[-1] / tests.size[taken]
+    middle, moved = candidates.shift[place] + steps[place], steps[tests.known :]
+    if best.term is None:
+        linear, square = moved
+        ends = middle - linear + square, middle + linear + square
+    else:
+        low, high = family.ranges[chosen[0]]
+        ends = middle + moved[0] * low, middle + moved[0] * high
+    return ParameterDrift(place, best.share, float(ends[0]), float(ends[1]), best.term)
