@@ -120,10 +120,8 @@ def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
     k, moves = made
-    statistics = fit.model.statistics
     nt = len(fit.theta)
-    prior = np.broadcast_to(statistics.ridge, len(statistics.gram) - nt)[moves[nt:]]
-    own = replace(statistics, gram=statistics.gram[np.ix_(moves, moves)], ridge=prior)
+    own = fit.model.statistics.among(moves, nt)
     with one_blas_thread():
         return (
             Influence.of(slopes[..., moves], own, k[:, moves], int(moves[:nt].sum())).uneven(errors)
