@@ -36,6 +36,7 @@ from orthaug.fitting.segments import Segments, packed, respond, sensitivity, sen
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
+from orthaug.models.statistics import prior_of
 from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
@@ -102,11 +103,9 @@ class FreeRunPoint:
         if not np.isfinite(information).all() or not np.isfinite(gradient).all():
             return None
         free = np.concatenate([self.inside, np.ones(len(self.w), dtype=bool)])
-        ridge = np.concatenate([0 * self.c, self.ridge + 0 * self.w])
+        penalised = information + np.diag(prior_of(information, self.ridge, len(self.c)))
         step = np.zeros(len(free))
-        step[free] = solve_scaled(
-            (information + np.diag(ridge))[np.ix_(free, free)], gradient[free]
-        )
+        step[free] = solve_scaled(penalised[np.ix_(free, free)], gradient[free])
         return step
 
 
@@ -156,9 +155,8 @@ class TermsResponse:
     @property
     def penalised(self) -> Matrix:
         """The information with the ridge."""
-        ridge = np.zeros(len(self.fitted))
-        ridge[self.parameters + self.terms :] = self.place.ridge
-        return self.information + np.diag(ridge)
+        nt = self.parameters + self.terms
+        return self.information + np.diag(prior_of(self.information, self.place.ridge, nt))
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
         """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""

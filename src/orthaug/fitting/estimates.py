@@ -20,7 +20,7 @@ from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion, Prediction, Simulation
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.output_noise import OutputNoise, noise_of
 from orthaug.fitting.setup import TrainingSetup
@@ -402,8 +402,19 @@ class Estimate(FitView):
         return None if found is None else changes + found
 
     def _changes_of_training(self) -> Matrix | None:
-        """Return `_changes_without_each` while the points of the split stay."""
-        raise NotImplementedError
+        """Return `_changes_without_each` while the points of the split stay, on the free run."""
+        statistics, moves = self.model.statistics, self.moves_by()
+        free_run = self.criterion.free_run
+        assert free_run is not None, "training one step ahead has its own"
+        if self.scores is None or statistics.gram is None or moves is None:
+            return None
+        scores = self.scores.by_recording(self.problem.record, free_run.washout)
+        if scores is None:
+            return None
+        k, free = moves
+        nt = int(free[: len(self.theta)].sum())
+        half = half_inverse(statistics.among(free, len(self.theta)).information(nt), nt)
+        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * left_out(len(scores))
 
     def _rows_of_split(self) -> tuple[Projection, Matrix | None, Matrix, Vector] | None:
         """Return the points of the split, where these are training rows; None where they are not.
@@ -423,19 +434,6 @@ class Estimate(FitView):
     def moves_by(self) -> tuple[Matrix, Vector] | None:
         """Return ∂θ/∂(c, w), and which entries of (c, w) move; None where that is not known."""
         raise NotImplementedError
-
-    def _changes_of_free_run(self, free_run: Simulation) -> Matrix | None:
-        """Return `_changes_of_training` on the free run."""
-        statistics, moves = self.model.statistics, self.moves_by()
-        if self.scores is None or statistics.gram is None or moves is None:
-            return None
-        scores = self.scores.by_recording(self.problem.record, free_run.washout)
-        if scores is None:
-            return None
-        k, free = moves
-        nt = int(free[: len(self.theta)].sum())
-        half = half_inverse(statistics.among(free, len(self.theta)).information(nt), nt)
-        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * left_out(len(scores))
 
     def withheld(self: Fit, kind: str, why: Warning) -> Fit:
         """Return the fit without standard errors and intervals of θ, terms and predictions.

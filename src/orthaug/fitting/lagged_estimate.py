@@ -60,7 +60,12 @@ class LaggedEstimate(Estimate):
 
     @property
     def robust_kinds(self) -> tuple[str, ...]:
-        """Robust standard errors that there are for its criterion, the default first."""
+        """Robust standard errors that there are for its criterion, the default first.
+
+        None where a parameter is at a bound, or where a noise model has its own.
+        """
+        if self.at_bound or self.model.coloured:
+            return ()
         return ("newey-west", "hc3") if self.criterion.free_run is None else ROBUST_FREE_RUN
 
     @property
@@ -160,8 +165,6 @@ class LaggedEstimate(Estimate):
                 "white innovations."
             )
         simulates = self.criterion.free_run is not None
-        kinds = self.robust_kinds
-        kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
                 "robust standard errors need a fit with standard errors and no parameter at a "
@@ -169,6 +172,8 @@ class LaggedEstimate(Estimate):
             )
         if simulates:
             return super().robust(lags, kind)
+        kinds = self.robust_kinds
+        kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if kind == "hc3":
             return self._hc3()
         residual = self.model.predict(self.problem.record).errors
@@ -235,11 +240,11 @@ class LaggedEstimate(Estimate):
         return learner_slope(self.model, points, problem.projection, unit, problem.noise)
 
     def _changes_of_training(self) -> Matrix | None:
-        problem, free_run = self.problem, self.criterion.free_run
+        problem = self.problem
         if self.at_bound or isinstance(problem, StreamedProblem):
             return None
-        if free_run is not None:
-            return self._changes_of_free_run(free_run)
+        if self.criterion.free_run is not None:
+            return super()._changes_of_training()
         owner, experiments = self._owner, problem.record.recordings[-1] + 1
         if self._solved:
             return split_without_each(

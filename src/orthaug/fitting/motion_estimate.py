@@ -218,11 +218,6 @@ class MotionEstimate(Estimate):
         assert slope is not None, "p̂ is not unique"
         return self.coordinates.slopes(self.theta) * (slope @ step)
 
-    def _changes_of_training(self) -> Matrix | None:
-        free_run = self.criterion.free_run
-        assert free_run is not None, "a motion is trained on its free run"
-        return self._changes_of_free_run(free_run)
-
     def _rows_of_split(self) -> tuple[Projection, Matrix | None, Matrix, Vector] | None:
         owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):

@@ -169,14 +169,9 @@ def _errors_together(
     record: Record, orders: Orders, pairs: Sequence[Pair], length: int | None
 ) -> tuple[float, ...] | None:
     """Return the error of the free run of all outputs on the last rows, as `_errors`."""
-    first = orders.first_row
-    usable = [e for e in record.experiments if len(e) > first + 1]
-    if length is not None:
-        usable = [piece for e in usable for piece in _cut(e, first, length)]
-    rows = sum(len(e) - first for e in usable)
-    cut = int(FITTED * rows)
-    columns = orders.na * len(record.outputs) + sum(orders.nb) + 1
-    if cut < 2 * columns or rows - cut < 2:
+    first, columns = orders.first_row, orders.na * len(record.outputs) + sum(orders.nb) + 1
+    usable, cut = _fitted_rows(record, orders, length, columns)
+    if not usable:
         return None
     theta = _fit_together(usable, orders, pairs, cut, constant=True)
     if theta is None:
@@ -426,16 +421,11 @@ def _errors(
     Args:
         poles: of each output, denominators by their degree at which refinement begins, too.
     """
-    first = orders.first_row
-    usable = [e for e in record.experiments if len(e) > first + 1]
-    if length is not None:
-        usable = [piece for e in usable for piece in _cut(e, first, length)]
-    rows = sum(len(e) - first for e in usable)
-    cut, found = int(FITTED * rows), []
+    columns, found = orders.size + 1, []
+    usable, cut = _fitted_rows(record, orders, length, columns)
+    if not usable:
+        return None
     for j in range(len(record.outputs)):
-        columns = orders.size + 1
-        if cut < 2 * columns or rows - cut < 2:
-            return None
         own = OutputRows(usable, j, orders, cut)
         phi, y = np.concatenate(own.lags), own.target
         scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
@@ -495,7 +485,24 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
     return tuple(found)
 
 
-def _cut(e: Experiment, first: int, length: int) -> list[Experiment]:
-    """Return pieces of so many rows, each with the lags before it."""
-    begins = range(0, len(e) - first, length)
-    return [e.rows(begin, begin + length + first) for begin in begins]
+def _fitted_rows(
+    record: Record, orders: Orders, length: int | None, columns: int
+) -> tuple[list[Experiment], int]:
+    """Return the experiments that orders are tried on, and how many rows are fitted.
+
+    No experiments where the rows are too few for so many columns.
+
+    Args:
+        length: rows of a piece, each with the lags before it, that the experiments are cut into.
+    """
+    first = orders.first_row
+    usable = [e for e in record.experiments if len(e) > first + 1]
+    if length is not None:
+        usable = [
+            e.rows(begin, begin + length + first)
+            for e in usable
+            for begin in range(0, len(e) - first, length)
+        ]
+    rows = sum(len(e) - first for e in usable)
+    cut = int(FITTED * rows)
+    return ([] if cut < 2 * columns or rows - cut < 2 else usable), cut
