@@ -74,13 +74,6 @@ _SECTIONS = {  # of keys that are not in [training]
     "states": "learner.states",
     "kind": "structure.kind",
 }
-_BESIDE_MOTION = {
-    "baseline": "expected one of them, because both are the physics",
-    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
-    "inputs of its learner",
-    "physics": "expected none, because the parameters of a motion are physical: "
-    "[motion.parameters]",
-}
 
 
 class LagsSection(Section):
@@ -141,6 +134,20 @@ class BaselineSection(Section):
     def criterion(self, training: TrainingSection) -> Criterion:
         """Return the criterion of a spec."""
         return resolve(training.declared(CRITERIA, training.chosen_focus()))
+
+    def check_beside(self, spec: Spec) -> None:
+        """Raise ValueError for what a spec cannot have beside these physics."""
+        if spec.controller is not None:
+            raise ValueError(
+                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
+                'one with `integrator` = "discrete", or leave it out and estimate one step '
+                'ahead with `noise.model` = "arma"'
+            )
+        if spec.data.missing == "keep":
+            raise ValueError(
+                '`data.missing`: found "keep"; lagged physics needs the outputs of every row. '
+                'Leave rows out by "skip", or state the physics as a [motion]'
+            )
 
     def check_noise(self, spec: Spec, found: str) -> None:
         """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
@@ -359,49 +366,16 @@ class Spec(Section):
 
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:
-        for name in ("states", "outputs", "parameters"):
-            motion = self.motion
-            if motion is not None and motion.source is None and name not in motion.model_fields_set:
-                raise ValueError(f"the key 'motion.{name}' is missing")
         if self.motion is None and self.baseline is None:
             raise ValueError(
                 "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead"
             )
-        for name in ("baseline", "lags", "physics") if self.motion is not None else ():
-            if name in self.model_fields_set:
-                raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
-        if self.controller is not None and self.motion is None:
-            raise ValueError(
-                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
-                'one with `integrator` = "discrete", or leave it out and estimate one step '
-                'ahead with `noise.model` = "arma"'
-            )
-        self._check_gaps()
-        wrong = self.declared_physics.foreign_keys
+        physics = self.declared_physics
+        physics.check_beside(self)
         for i, section in enumerate(self.suspects):
-            for key in sorted(section.model_fields_set & wrong.keys()):
-                raise ValueError(f"`suspects[{i}].{key}`: found {wrong[key]}")
-        if self.motion is not None and self.training.ensemble:
-            raise ValueError(
-                "`training.ensemble`: a motion has none, because medians of runs follow no "
-                "equations"
-            )
+            for key in sorted(section.model_fields_set & physics.foreign_keys.keys()):
+                raise ValueError(f"`suspects[{i}].{key}`: found {physics.foreign_keys[key]}")
         return self
-
-    def _check_gaps(self) -> None:
-        """Raise ValueError where outputs may not be missing."""
-        if self.data.missing != "keep":
-            return
-        found = '`data.missing`: found "keep"'
-        if self.motion is None:
-            raise ValueError(
-                f"{found}; lagged physics needs the outputs of every row. Leave rows out by "
-                '"skip", or state the physics as a [motion]'
-            )
-        if self.noise.model != "white":
-            raise ValueError(f'{found}; a predictor of `noise.model` needs every row: "white"')
-        if self.engine.kind not in ("auto", "memory"):
-            raise ValueError(f'{found}; rows must be in memory for it: `engine.kind` = "memory"')
 
     @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:
