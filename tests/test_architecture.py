@@ -65,7 +65,6 @@ CONCEPTS = {
     "physics.mechanisms": "a kind of source",
     "physics.model_exchange": "the interface FMI",
     "analysis.contraction": "a norm in which a free run forgets its start",
-    "analysis.filtered_rows": "errors of a free run, filtered until noise in them is white",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",
