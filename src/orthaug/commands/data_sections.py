@@ -26,7 +26,6 @@ from orthaug.commands.sections import (
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.kinds import CRITERIA
 from orthaug.fitting.noise import OF_LAGGED
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_states
@@ -288,8 +287,7 @@ class MotionSection(KindSection):
         A motion is trained on its free run, from starts that are estimated: without a washout.
         """
         focus = "simulation" if training.focus == "auto" else training.focus
-        washout = {} if "washout" in training.model_fields_set else {"washout": 0}
-        return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
+        return resolve(training.declared_criterion(focus, washout=0))
 
     def check_beside(self, spec: Any) -> None:
         """Raise ValueError for what a spec cannot have beside these physics."""

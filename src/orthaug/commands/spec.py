@@ -133,7 +133,7 @@ class BaselineSection(Section):
 
     def criterion(self, training: TrainingSection) -> Criterion:
         """Return the criterion of a spec."""
-        return resolve(training.declared(CRITERIA, training.chosen_focus()))
+        return resolve(training.declared_criterion(training.chosen_focus()))
 
     def check_beside(self, spec: Spec) -> None:
         """Raise ValueError for what a spec cannot have beside these physics."""
@@ -263,11 +263,24 @@ class TrainingSection(KindSection):
         check_starts(self.restarts, self.seed, ensemble=self.ensemble)
         solver, criterion = (
             self.declared(SOLVERS, self.solver),
-            self.declared(CRITERIA, self.chosen_focus()),
+            self.declared_criterion(self.chosen_focus()),
         )
         given = self.regularization
         check_solver(solver, criterion, given if isinstance(given, list) else [given])
         return self
+
+    def declared_criterion(self, focus: str, washout: int | None = None) -> Criterion:
+        """Return the criterion of a focus, for physics whose free runs have this washout.
+
+        Where the section gives none and segments are as short as the usual washout or shorter, it
+        is a quarter of them.
+        """
+        segment: Any = getattr(self, "segment", "auto")
+        short = isinstance(segment, int) and 0 < segment <= getattr(self, "washout", 0)
+        own = segment // 4 if short and washout is None else washout
+        given = own is None or "washout" in self.model_fields_set
+        section = self if given else self.model_copy(update={"washout": own})
+        return section.declared(CRITERIA, focus)
 
     def chosen_focus(self) -> str:
         """Return the focus of training.
