@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, without_gaps
@@ -28,6 +28,8 @@ _TURNED = 100.0
 _GONE = -5.0
 _FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
 _GROWS = 10.0  # by a factor of e^10 over the record, a mode grows
+# Growth of an error over the record, and over a segment, as logarithms, and steps of a segment
+_LEAVES, _FOLLOWED, _SHORTEST = (12.0, 3.0, 8)
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
@@ -121,13 +123,32 @@ class GuessedMotion:
         return float(np.abs(self.modes).max(initial=0.0))
 
     @property
-    def grows(self) -> str:
-        """A clause on the fastest growing mode at the start, with a remedy; empty without one."""
+    def _growth(self) -> Vector:
+        """Growth [1/s] of the fastest growing mode, at every guessed state."""
         modes: Any = self.modes
         if self.motion.scheme.discrete and modes.size:
             with np.errstate(all="ignore"):
                 modes = np.log(modes) / self.record.sampling_time
-        fastest = float(modes.real.max(initial=0.0))
+        return modes.real.max(axis=1, initial=-np.inf)
+
+    @property
+    def steps_to_leave(self) -> int:
+        """Steps in which errors of a free run grow twenty-fold; 0 where the plant is not unstable.
+
+        It is where a mode grows at most of the guessed states, so that over the record no run
+        would follow the data. A loop that is simulated with its controller is not.
+        """
+        growth, step = self._growth, self.record.sampling_time
+        usual = float(np.median(growth)) if growth.size else 0.0
+        longest = step * max(len(one) for one in self.record.experiments)
+        if self.motion.held or not usual * longest > _LEAVES:
+            return 0
+        return max(int(_FOLLOWED / (usual * step)), _SHORTEST)
+
+    @property
+    def grows(self) -> str:
+        """A clause on the fastest growing mode at the start, with a remedy; empty without one."""
+        fastest = float(self._growth.max(initial=0.0))
         if self.motion.held or not fastest > _GROWS / len(self.record) / self.record.sampling_time:
             return ""
         return (
