@@ -15,6 +15,7 @@ from helpers import unfolded
 from test_motion_cli import friction, orthaug
 
 import orthaug as oa
+from orthaug.commands.advice import apply_change
 from orthaug.reports.page_verdict import fit_verdict
 
 LAGGED = """
@@ -224,3 +225,50 @@ def test_a_motion_is_not_advised_the_hold_or_the_learner_input_that_it_has(moved
         *(w.text for w in fitted.result.warnings),
     ]
     assert not any("sees v" in text or "learner see" in text for text in told)
+
+
+TANK = """
+[data]
+sampling_time = 1.0
+inputs = ["u"]
+outputs = ["T"]
+train = { files = ["run.csv"] }
+[motion]
+[motion.states]
+x = { derivative = "(gain*u - x)/tau", start = "T" }
+[motion.outputs]
+T = "x"
+[motion.parameters]
+gain = { initial = 1.5, min = 0 }
+tau = { initial = 15.0, min = 0 }
+"""
+
+
+@pytest.mark.parametrize("by_lag", [False, True], ids=["delay", "lag"])
+def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by_lag: bool):
+    """A delay of which a lag leaves four times the noise was called hardly distinct from it."""
+    random = np.random.default_rng(3)
+    u = np.repeat(random.uniform(-1, 1, 13), 50)[:600]
+    late, x, y = u[0], 0.0, []
+    for k in range(600):
+        y.append(x)
+        late = u[max(k - 7, 0)] if not by_lag else late + (1 - np.exp(-1 / 7)) * (u[k] - late)
+        x += (1 - np.exp(-1 / 20)) * (2 * late - x)
+    data = np.column_stack([u, y + 0.01 * np.std(y) * random.normal(size=600)])
+    fitted = oa.fit_spec(str(put(tmp_path, TANK, data, "u,T")))
+    codes = {warning.code: warning.text for warning in fitted.result.warnings}
+    first = fitted.result.advice[0]
+    assert not any("hardly distinguish" in text for text in codes.values())
+    assert ("slow_input" in codes, "dead_time" in codes) == (by_lag, not by_lag)
+    assert first.after < 0.1 * first.before
+    if by_lag:
+        assert first.text.startswith("With a lag of u (the state u_late, time constant T2)")
+        return
+    assert first.text.startswith('With u 7 samples later (step = "shift" of data.prepare)')
+    assert first.change == {"data.prepare": [{"step": "shift", "channel": "u", "samples": 7}]}
+    spec = tmp_path / "spec.toml"
+    declared = apply_change(tomllib.loads(TANK), first.change)
+    spec.write_text(tomlkit.dumps(declared))
+    followed = oa.fit_spec(str(spec))
+    assert followed.result.scores["train"].simulation.nrmse[0] < 0.02
+    assert not any(w.code in ("slow_input", "dead_time") for w in followed.result.warnings)

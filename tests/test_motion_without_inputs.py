@@ -218,3 +218,56 @@ def test_starts_that_settle_slowly_are_no_poor_minimum():
     errors = fit.segmented.objective().errors(fit.alone, (), fit.states, fit.segmented.segments)
     left = np.sqrt(np.mean((errors / run.std(axis=0)[:, None]) ** 2))
     assert left < 0.46
+
+
+def test_a_run_from_a_poor_start_is_judged_from_the_start_of_training():
+    """Without inputs no text speaks of them; prey that a capacity limits were called explained by nothing."""
+
+    def rate(_, n):
+        return [1.1 * n[0] * (1 - n[0] / 40) - 0.4 * n[0] * n[1], 0.1 * n[0] * n[1] - 0.4 * n[1]]
+
+    t = 0.1 * np.arange(450)
+    run = scipy.integrate.solve_ivp(rate, (0, t[-1]), (10, 5), t_eval=t, rtol=1e-9).y.T
+    run = run * (1 + 0.01 * np.random.default_rng(5).normal(size=run.shape))
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("h", "a*h - b*h*l", start="hare"),
+            oa.State("l", "d*h*l - c*l", start="lynx"),
+        ],
+        outputs=[oa.Output("hare", "h"), oa.Output("lynx", "l")],
+        parameters=[
+            oa.PhysicalParameter(n, v, min=0) for n, v in dict(a=1.0, b=0.3, c=0.5, d=0.08).items()
+        ],
+        substeps=1,
+    )
+    record = oa.Record.from_arrays(None, run, outputs=["hare", "lynx"], sampling_time=0.1)
+    fit = oa.estimate(record, motion, learner=None)
+    found = fit.diagnose()
+    texts = {warning.code: warning.text for warning in found.warnings}
+    assert "give `simulate` more rows to start from" in texts["noisy_start"]
+    assert "explains_nothing" not in texts and "growing_mode" in texts
+    assert not any("input" in text or "controller" in text for text in texts.values())
+    judged = found.residuals.predictable[0]
+    assert judged.rms < 0.6 * found.scores["train"].simulation.rmse[0]
+
+
+def test_a_record_without_inputs_that_is_not_explained_is_advised_no_input():
+    """A growth that the equation has as a decay, and noise about rest."""
+    t = 0.1 * np.arange(300)
+    noise = 0.05 * np.random.default_rng(1).normal(size=300)
+    motion = oa.Motion.from_equations(
+        states=[oa.State("x", "-k*x", start="y")],
+        outputs=[oa.Output("y", "x")],
+        parameters=[oa.PhysicalParameter("k", 0.1, min=0)],
+    )
+    for values, remedy in (
+        (
+            np.exp(0.1 * t) + noise,
+            "Check the sign of every term, the initial values and the bounds.",
+        ),
+        (noise, "Give data that begin far from rest."),
+    ):
+        record = oa.Record.from_arrays(None, values, outputs=["y"], sampling_time=0.1)
+        found = oa.estimate(record, motion, learner=None).diagnose()
+        texts = {warning.code: warning.text for warning in found.warnings}
+        assert texts["explains_nothing"].endswith(remedy)

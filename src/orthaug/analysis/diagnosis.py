@@ -27,7 +27,6 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
-from orthaug.analysis.output_response import from_fitted_start
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
 from orthaug.analysis.quantised_output import coarse_steps, quantised_output
 from orthaug.analysis.residuals import (
@@ -39,6 +38,7 @@ from orthaug.analysis.residuals import (
     measured_of,
     rms_errors,
 )
+from orthaug.analysis.trained_start import from_trained_start
 from orthaug.analysis.verdict_text import (
     SHARE,
     Diagnosis,
@@ -83,7 +83,6 @@ _SIZABLE = 0.02
 _FEWEST_COMPLETE = 30  # rows with all outputs, to test residuals
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
-_BY_START = 0.5  # of the error's squares: less is left where noise in the measured start made most
 _UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
 
 
@@ -158,11 +157,14 @@ def _of_motion(
         return None
     if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
         return None
+    restarted = from_trained_start(fit, free_run)
+    free_run = free_run if restarted is None else restarted[0].response
     coarse = quantised_output(fit, free_run)
     errors = errors_of(free_run) if coarse is None else coarse.left
     firsts = [run.start for run in free_run.trajectories]
     inputs = [e.inputs[first:] for e, first in zip(record.experiments, firsts, strict=True)]
-    states = [own[first:] for own, first in zip(_states(fit), firsts, strict=True)]
+    along = (restarted and restarted[0].states) or _states(fit)
+    states = [own[first:] for own, first in zip(along, firsts, strict=True)]
     if not np.isfinite(np.concatenate(states)).all():
         return None
     if not record.complete:  # tests of several outputs need them on the same rows
@@ -201,9 +203,9 @@ def _of_motion(
     text = free_run_words(
         verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse
     )
-    warnings = [one.warning for one in late] + (
-        [coarse.warning] if coarse and coarse.warning else []
-    )
+    warnings = [restarted[1]] if restarted else []
+    warnings += [one.warning for one in late]
+    warnings += [coarse.warning] if coarse and coarse.warning else []
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
@@ -274,10 +276,8 @@ def _of_lagged(
     if not model.form.states:
         return _conclude(replace(seen, **_effects(fit, one_step, one_step, False)), None)
     free_run = model.simulate(problem.record) if free_run is None else free_run
-    skip, restarted = fit.criterion.washout, None
-    if simulated and fit.criterion.simulates:
-        restarted = _from_other_start(fit, free_run)
-        free_run = free_run if restarted is None else restarted[0]
+    skip, restarted = fit.criterion.washout, from_trained_start(fit, free_run)
+    free_run = free_run if restarted is None else restarted[0].response
     free_runs = [(free_run, skip)] if not any(t.diverged for t in free_run.trajectories) else []
     free_tests = _tests(problem, free_run, skip) if free_runs else None
     trained = _physics_runs(fit) if not simulated and not white else []
@@ -307,34 +307,6 @@ def _of_lagged(
         )
     found = _conclude(seen, free_run if free_runs else None)
     return found if restarted is None else replace(found, warnings=(restarted[1], *found.warnings))
-
-
-def _from_other_start(fit: LaggedEstimate, free_run: Response) -> tuple[Response, Warning] | None:
-    """Return the free run from the lags that follow the outputs best, and a warning.
-
-    Training on the free run chooses these lags, too. None where the measured ones do nearly as
-    well, or the free run is not linearised.
-    """
-    if any(run.diverged for run in free_run.trajectories):
-        return None
-    other = from_fitted_start(fit.model, fit.problem.record, free_run)
-    if other is None:
-        return None
-    before, after = rms_errors(free_run), rms_errors(other)
-    unit = fit.problem.deviation
-    if np.sum((after / unit) ** 2) > _BY_START * np.sum((before / unit) ** 2):
-        return None
-    worst = int(np.argmax(before / unit))
-    output = free_run.outputs[worst]
-    of = f"{output.name}{' [' + output.unit + ']' if output.unit else ''}"
-    text = (
-        "the free run begins at measured rows, and the model remembers their noise for long: from "
-        f"the start that training found, its error of {of} is {after[worst]:.3g} instead of "
-        f"{before[worst]:.3g}. Scores are from the measured start, the tests of the residual from "
-        "the better one. Judge the model by the latter, or give `simulate` rows to start from "
-        "that are smoothed (--initial)."
-    )
-    return other, Warning("noisy_start", text)
 
 
 def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:

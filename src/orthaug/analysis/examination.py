@@ -22,6 +22,7 @@ from orthaug.analysis.informative_data import explains_nothing, few_frequencies
 from orthaug.analysis.physics_findings import analyse_physics, describe_physics, imitable
 from orthaug.analysis.robustness import robust_where_asked
 from orthaug.analysis.scoring import score_part
+from orthaug.analysis.trained_start import from_trained_start
 from orthaug.analysis.validation import (
     Trial,
     Verdict,
@@ -105,7 +106,9 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
         run, estimated = responses[evidence.train.name][1], len(fit.problem.names)
         residuals = fields["residuals"]
         driven = residuals is not None and residuals.verdict == "unmodelled"
-        warnings += explains_nothing(run, evidence.train, estimated, driven=driven)
+        judged = partial(explains_nothing, part=evidence.train, parameters=estimated, driven=driven)
+        other = from_trained_start(fit, run) if judged(run) else None
+        warnings += judged(run if other is None else other[0].response)
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
     content = fields | {

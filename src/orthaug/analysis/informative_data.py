@@ -107,7 +107,7 @@ def explains_nothing(
     """Return a warning where a free run explains no more of an output than of noise.
 
     Args:
-        free_run: over the training data, on which it was trained.
+        free_run: over the training data, on which it was trained, from the start of training.
         part: the training data.
         parameters: number of those that are estimated.
         driven: whether the error is more than noise: then the outputs move, but otherwise.
@@ -126,12 +126,15 @@ def explains_nothing(
     ]
     if not none:
         return ()
+    inputs = bool(part.record.inputs)
+    checked = "the sign and the unit of every input" if inputs else "the sign of every term"
+    wanted = "in which the inputs move the outputs" if inputs else "that begin far from rest"
     meant = (
-        "The outputs do move, but not as the physics says. Check the sign and the unit of every "
-        "input, the initial values and the bounds."
+        f"The outputs do move, but not as the physics says. Check {checked}, the initial values "
+        "and the bounds."
         if driven
         else "The parameters are those of the noise, but for what the mean determines, and their "
-        "intervals mean nothing. Give data in which the inputs move the outputs."
+        f"intervals mean nothing. Give data {wanted}."
     )
     text = (
         f"the free run explains no more of {join_words(none)} than it would of noise by chance. "

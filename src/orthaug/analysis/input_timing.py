@@ -25,7 +25,7 @@ ROWS = 4000  # at most
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
-_ALIKE = 0.25  # of what the better gains: by less a lag and a delay are not distinguished
+_ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -221,8 +221,7 @@ class LateInput:
     @property
     def alike(self) -> bool:
         """True if the data hardly distinguish a lag from a delay."""
-        gained = self.declared - min(self.lagged, self.delayed)
-        return abs(self.lagged - self.delayed) < _ALIKE * gained
+        return abs(self.lagged - self.delayed) < _ALIKE * min(self.lagged, self.delayed)
 
     @property
     def manner(self) -> str:

@@ -112,7 +112,8 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
         f"a mode of {subject} grows at {percent(found.growing, 3)} of the points of the free run, "
         f"by up to {found.rightmost:.4g} 1/s: small errors grow there."
     )
-    if not held and found.median > 0:  # the plant is unstable where it mostly is
+    driven = bool(model.form.motion.inputs)
+    if driven and not held and found.median > 0:  # the plant is unstable where it mostly is
         warning += " If a controller held the plant, give `controller` and the reference as input."
     return MotionStability(found, (Warning("growing_mode", warning),), text)
 

@@ -11,18 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
-from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
+from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult, LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, declared_output
 from orthaug.commands.spec import spec_model
+from orthaug.data.preparation import prepare
 from orthaug.data.record import Record
+from orthaug.data.steps import Shift
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.reports.result import FitResult
@@ -44,6 +46,8 @@ class Proposal:
     refocuses: bool = False
     positive: str | None = None
     """A parameter that has to be positive, such as the size of a dead zone."""
+    step: Any = None
+    """Step of preparation that the change adds: the rows of the trial have the others already."""
 
     def accepts(self, fit: Any) -> bool:
         """Return whether the result of a changed spec agrees with the words of the proposal."""
@@ -63,7 +67,7 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
             list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
         )
     found = [
-        *_lags(job, result),
+        *_late_inputs(job, result),
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
@@ -86,13 +90,29 @@ def _is_biased(result: FitResult) -> bool:
     )
 
 
-def _lags(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield a state for each input that acts through a lag."""
+def _late_inputs(job: Job, result: FitResult) -> Iterator[Proposal]:
+    """Yield a lag or a delay of each input that acts late: the better, and both where alike."""
     for late in result.residuals.late if result.residuals is not None else ():
-        made = job.physics.with_lag(job, late, _new_name(job, "T"))
-        if made is not None and (late.by_lag or late.alike):
-            change, words = made
-            yield Proposal(words, change)
+        kinds = (_lag, _delay) if late.by_lag else (_delay, _lag)
+        for kind in kinds if late.alike else kinds[:1]:
+            yield from kind(job, late)
+
+
+def _lag(job: Job, late: LateInputResult) -> Iterator[Proposal]:
+    """Yield a state for an input, if the physics can have one."""
+    made = job.physics.with_lag(job, late, _new_name(job, "T"))
+    if made is not None:
+        change, words = made
+        yield Proposal(words, change)
+
+
+def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
+    """Yield a shift of an input in the preparation of the data."""
+    step = Shift(late.input, late.delay)
+    declared = {"step": "shift", "channel": late.input, "samples": late.delay}
+    steps = [*job.declaration["data"].get("prepare", []), declared]
+    words = f'{late.input} {plural(late.delay, "sample")} later (step = "shift" of data.prepare)'
+    yield Proposal(words, {"data.prepare": steps}, step=step)
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
@@ -296,6 +316,18 @@ class ValidationRows:
         training, held = held_out_blocks(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
 
+    def prepared(self, step: Any, missing: str) -> ValidationRows:
+        """Return the rows after a further step of preparation; what is `missing` as in a spec.
+
+        Raises:
+            InputError: it cannot be done with these rows.
+        """
+        kept = "keep" if missing == "keep" else "skip"
+        training, held = (
+            prepare(record, step, missing=kept) for record in (self.training, self.held)
+        )
+        return replace(self, training=training, held=held)
+
 
 @dataclass(frozen=True, eq=False)
 class ProposalErrors:
@@ -336,17 +368,25 @@ class Trials:
         )
 
     def run(
-        self, job: Job, variant: Variant, accepts: Callable[[Any], bool] = lambda fit: True
+        self,
+        job: Job,
+        variant: Variant,
+        accepts: Callable[[Any], bool] = lambda fit: True,
+        step: Any = None,
     ) -> Pieces | None:
         """Return the squared errors of the free run of a job's model.
 
         None where training failed, or the fit is not accepted.
+
+        Args:
+            step: of preparation, which its rows still lack.
         """
         try:
-            fit = job.fold_fit(variant, briefly=True)(self.rows.training)
+            rows = self.rows if step is None else self.rows.prepared(step, job.spec.data.missing)
+            fit = job.fold_fit(variant, briefly=True)(rows.training)
             if not fit.status.ok or not accepts(fit):
                 return None
-            return squared_errors(fit.model.simulate(self.rows.held), self.unit, self.rows.skips)
+            return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips)
         except InputError as error:
             LOG.info("a change was not tried: %s", error)
             return None
@@ -360,7 +400,7 @@ class Trials:
             return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
         kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
-        pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts)
+        pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
         return ProposalErrors(proposal, pieces, physics_only)
 
 

@@ -152,10 +152,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.states.{state}": {key: f"({late.input} - {state})/{name}", "start": first},
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
-        words = f"a lag of {late.input} (the state {state}, time constant {name}"
-        if not late.by_lag:
-            words += '; a dead time, by step = "shift" of data.prepare, fits physics alone better'
-        return change, f"{words})"
+        return change, f"a lag of {late.input} (the state {state}, time constant {name})"
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:
