@@ -51,7 +51,7 @@ class Criterion(Protocol):
         """The free run that training makes; None for one step ahead."""
         ...
 
-    def on(self, record: Record, first_row: int = 0) -> Any:
+    def on(self, record: Record, first_row: int = 0, most: int = 0) -> Any:
         """Return the criterion with its open choices made for a record."""
         ...
 
