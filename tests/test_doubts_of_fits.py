@@ -526,3 +526,67 @@ def test_disturbances_that_add_up_are_no_missing_physics():
     assert "unexplained" not in {warning.code for warning in found.warnings}
     for row, true in zip(found.parameters, (9.0, 2.0, 0.8), strict=True):
         assert abs(row.value - true) < 3.5 * row.std
+
+
+def test_drag_of_a_pendulum_is_named_and_no_friction_that_pushes():
+    """Beside its damper sign(om) of the wrong sign explains as much as drag: "dry friction" of +0.46."""
+    step, rng = 0.02, np.random.default_rng(10)
+    x, fine, angle = np.array([2.6, 0.0]), 10, []
+    for _ in range(1100):
+        angle.append(x[0])
+        for _ in range(fine):
+            rate = -21.8 * np.sin(x[0]) - 0.05 * x[1] - 0.06 * x[1] * abs(x[1])
+            x = x + step / fine * np.array([x[1] + step / fine * rate, rate])
+    record = oa.Record.from_arrays(
+        None, np.array(angle) + 0.01 * rng.normal(size=1100), outputs=["phi"], sampling_time=step
+    )
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("th", "om", start="phi"),
+            oa.State("om", "-w2*sin(th) - d*om", start="derivative of phi"),
+        ],
+        [oa.Output("phi", "th")],
+        [oa.PhysicalParameter(name, at, min=0) for name, at in (("w2", 20), ("d", 0.1))],
+    )
+    found = oa.diagnose(oa.estimate(record, motion, learner=None))
+    assert found is not None and found.missing is not None
+    best = found.missing.terms[0]
+    assert (best.equation, best.term) == ("om", "om*abs(om)") and best.coefficient < 0
+    assert "growing with its square, as quadratic drag: -" in found.text
+    assert "dry friction" not in found.text
+
+
+@pytest.mark.parametrize(
+    ("cube", "friction", "words"),
+    [
+        ((0.0, -0.5), 0.0, "growing faster than it: -"),
+        ((-40.0, 0.0), 0.0, "growing faster than it, as a hardening spring: -"),
+        ((0.0, 0.0), -1.0, "with a jump at 0, as dry friction: -"),
+    ],
+    ids=["of an input", "spring", "friction"],
+)
+def test_a_spring_and_friction_are_named_where_they_act_against_a_state(cube, friction, words):
+    """A cube of an input with a negative sign was a hardening spring, too."""
+    rng = np.random.default_rng(7)
+    force = np.repeat(rng.uniform(-2, 2, 40), 10)
+    x, v, y, fine = 0.0, 0.0, [], 40
+    for u in force:
+        y.append(x)
+        for _ in range(fine):
+            spring = cube[0] * 25 * x**3 + cube[1] * u**3
+            v += 0.05 / fine * (u - 0.8 * v - 10 * x + spring + 0.3 * friction * np.sign(v))
+            x += 0.05 / fine * v
+    record = oa.Record.from_arrays(
+        u=force, y=np.array(y) + 0.01 * np.std(y) * rng.normal(size=400), sampling_time=0.05
+    )
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", start="y"),
+            oa.State("v", "(u - c*v - k*x)/m", start="derivative of y"),
+        ],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter(name, at, min=0) for name, at in (("m", 1), ("c", 1), ("k", 12))],
+        ["u"],
+    )
+    found = oa.diagnose(oa.estimate(record, motion, learner=None))
+    assert found is not None and words in found.text

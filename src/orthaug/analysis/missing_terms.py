@@ -24,25 +24,14 @@ from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
-from orthaug.analysis.bias import place_of
+from orthaug.analysis.missing_term import BEYOND, POWERS, SHAPES, MissingTerm
 from orthaug.analysis.suspects import changes_sign
 from orthaug.analysis.term_sensitivities import Sensitivities, Terms, sensitivities
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.whiteness import whitening_filter
 from orthaug.physics.motion import Motion
 
-SHAPES = ("linear", "jump", "absolute", "square", "cube")
 _EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
-_TERMS = ("{}", "sign({})", "abs({})", "{}**2", "{}**3")
-_MEANINGS = (
-    "linear in {}",
-    "odd in {} with a jump at 0, as dry friction",
-    "even in {}, with a kink at 0",
-    "even in {}, without a kink",
-    "odd in {} and growing faster than it, as a hardening spring",
-)
-_ONE_SIDED = ("linear in {}", "", "", "curved in {}", "curved in {}, most where that is large")
-BEYOND = "beyond"  # the shape of a term that is zero up to a width, as past the ends of a gap
 # Shares of a variable's size, by quantiles: the widths that are tried, and those for the best one
 _WIDTHS, _FINER = (0.5, 0.8), tuple(np.linspace(0.1, 0.95, 18).tolist())
 # Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
@@ -60,91 +49,11 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 # Of what the best simple term leaves: a term with the best of many widths is named first below it.
 # Saturations leave 0.2 to 0.6 of what a cube does, cubic springs 0.4 to 1 (missing_terms.py)
 _LESS = 0.6
+# Of its gain, of friction or drag that pushes along a movement, and of drag of no movement: beside
+# a damper the right sign has nearly the same effect, and a cubic spring is nearly a square one
+_UNLIKELY = 0.8
 _CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
-
-
-@dataclass(frozen=True)
-class MissingTerm:
-    """A term that could be added: its equation, its variable, its shape, and what it would explain.
-
-    `equation` is None of a term of an output, which `output` names then. `coefficient` is in the
-    units of equation and variable, `share` that of the errors' variance,
-    less what chance explains.
-    """
-
-    equation: str | None
-    variable: str | None
-    """None for a constant."""
-    shape: str
-    coefficient: float
-    share: float
-    one_sided: bool = False
-    """True if the variable keeps its sign over the data: nothing is then known of odd and even."""
-    factors: tuple[str, ...] = ()
-    """Of a product, its variables; `variable` is then the product itself, linear in it the term."""
-    width: float | None = None
-    """Of a term that begins beyond a size of its variable, that size."""
-    reference: float | None = None
-    """Of a variable that keeps its sign, such as a temperature, what the term counts from: it is
-    the term's value there that is subtracted.
-    """
-    output: str | None = None
-
-    @property
-    def place(self) -> str:
-        """Where the term stands, in words."""
-        return place_of(self.equation, self.output)
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """States and inputs that the term depends on."""
-        return self.factors or (() if self.variable is None else (self.variable,))
-
-    @property
-    def term(self) -> str:
-        """The term without its coefficient, as an expression."""
-        if self.variable is None:
-            return "1"
-        if self.width is None:
-            term = _TERMS[SHAPES.index(self.shape)].format(self.variable)
-            if self.reference is None:
-                return term
-            return f"({term} {'-' if self.reference >= 0 else '+'} {abs(self.reference):.4g})"
-        size = f"{self.width:.4g}"
-        return f"(max({self.variable} - {size}, 0) + min({self.variable} + {size}, 0))"
-
-    @property
-    def expression(self) -> str:
-        """The term in the equation's own names."""
-        if self.variable is None:
-            return f"{self.coefficient:.3g}"
-        return f"{self.coefficient:.3g}*{self.term}"
-
-    @property
-    def meaning(self) -> str:
-        """Its kind in words."""
-        if self.width is not None:
-            place = f"about |{self.variable}| = {self.width:.3g}"
-            return f"that begins at {place}, as a saturation, an end stop or a gap"
-        words = _ONE_SIDED if self.one_sided else _MEANINGS
-        if self.reference is not None and self.shape == "linear":
-            return words[0].format(self.term)
-        return (
-            "constant"
-            if self.variable is None
-            else words[SHAPES.index(self.shape)].format(self.variable)
-        )
-
-    def curves_like(self, other: MissingTerm) -> bool:
-        """Return whether both count from a level of one variable: nearly straight there."""
-        same = (self.place, self.variable) == (other.place, other.variable)
-        return same and self.reference is not None and other.reference is not None
-
-    def __str__(self) -> str:
-        meaning = self.meaning  # a sensor has no springs and no friction
-        meaning = meaning if self.equation is not None else meaning.partition(", as")[0]
-        return f"{self.place} lacks something {meaning}: {self.expression}"
 
 
 @dataclass(frozen=True)
@@ -295,38 +204,87 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     if tested is None:
         return None
     p, freedom, share, gains, shares, coefficients, references = tested
-    if tried.count > tried.simple:
-        # Simple terms are tested by themselves, too: the others would take power from them
-        by_term = np.arange(len(gains)) % tried.count < tried.simple
-        alone = _joint_test(found.with_terms(by_term))
-        if alone is not None and alone[0] < p:
-            p, freedom, share = alone[:3]
+    of = np.arange(len(gains)) % tried.count
+    simple = of < tried.simple
+    shape = np.where(simple & (of > 0), (of - 1) % len(SHAPES), -1)
+    # Simple terms are tested by themselves, too: the others would take power from them, and so
+    # would drag, which is nearly made up of their shapes
+    kept = simple & (shape != SHAPES.index("drag"))
+    numbers = np.append(np.cumsum(kept) - 1, -1)[constants][kept]
+    alone = _joint_test(found.with_terms(kept), numbers if simple.all() else None)
+    if alone is not None and (alone[0] < p or simple.all()):
+        p, freedom, share = alone[:3]
+    if not simple.all():
         p = min(2 * p, 1.0)
-        gains = np.where(by_term, gains, _RIVAL * gains)
+        gains = np.where(simple, gains, _RIVAL * gains)
     # Over a range that is small beside the level all shapes are nearly straight
-    straight = (np.arange(len(gains)) % tried.count - 1) % len(SHAPES) == SHAPES.index("linear")
+    straight = shape == SHAPES.index("linear")
     gains = np.where(np.isfinite(references) & ~straight, _CURVED * gains, gains)
+    own = np.concatenate([_own(tried, motion, equation) for equation in equations])
+    pushes = own * coefficients > 0
+    unlikely = (shape == SHAPES.index("jump")) & pushes
+    unlikely |= (shape == SHAPES.index("drag")) & (pushes | (own == 0))
+    gains = np.where(unlikely, _UNLIKELY * gains, gains)
     named: list[tuple[int, MissingTerm]] = []
     for j in np.argsort(-gains):
-        if not gains[j] > _RIVAL * gains.max():
-            break
-        place, number = divmod(int(j), tried.count)
-        made = (names[equations[place]], number, float(coefficients[j]), float(shares[j]))
+        rivals = gains[simple] if simple[j] else gains  # widths are named beside a simple term
+        if not gains[j] > _RIVAL * rivals.max():
+            continue
+        at, number = divmod(int(j), tried.count)
+        made = (names[equations[at]], number, float(coefficients[j]), float(shares[j]))
         term = _term(tried, sizes[0], *made)
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
-        if equations[place] >= len(motion.states):
+        if equations[at] >= len(motion.states):
             term = replace(term, equation=None, output=term.equation)
+        elif not term.factors and term.variable is not None:
+            row = tried.choice[tried.names.index(term.variable)]
+            against = _acts_against(fit, equations[at], row, term.coefficient)
+            term = replace(term, against=against)
         if not any(term.curves_like(other) for _, other in named):
-            named.append((place, term))
+            named.append((at, term))
     listed = [term for _, term in named]
     for place, term in named:
-        if term.shape in (BEYOND, "cube") and term.reference is None:
+        if term.shape in (BEYOND, "cube", "drag") and term.reference is None:
             best = _finer(fit, tried, equations[place], term)
+            best = term if best is None and term.shape == BEYOND else best
             listed = listed if best is None else _with_finer(listed, best)
             break
     return MissingTest(p, freedom, share, tuple(listed))
+
+
+def _own(tried: _Tried, motion: Motion, equation: int) -> Vector:
+    """Return how the variable of each term follows the equation's state; 0 where it does not."""
+    found = np.zeros(tried.count)
+    if equation < len(motion.states):
+        found[1 : tried.simple] = np.repeat(tried.choice[:, equation], len(SHAPES))
+    return found
+
+
+def _acts_against(
+    fit: MotionEstimate, equation: int, row: Vector, coefficient: float
+) -> str | None:
+    """Return what an odd term of a variable acts against, as `MissingTerm.against` has it.
+
+    Args:
+        row: of the variable (nx + nu,) by states and inputs.
+    """
+    motion, segmented = fit.problem.motion, fit.segmented
+    nx = len(motion.states)
+    if row[nx:].any():
+        return None
+    if row[equation]:
+        return "movement" if coefficient * row[equation] < 0 else None
+    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
+    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
+    point, inputs, p = x[len(x) // 2], u[len(x) // 2], motion.coordinates.physical(c)
+    step = _MOVED * max(float(np.abs(x[:, equation]).max()), _MOVED) * (np.arange(nx) == equation)
+    with np.errstate(all="ignore"):
+        before, after = (
+            np.asarray(motion.rates(point + moved, inputs, p, np)) for moved in (-step, step)
+        )
+    return "displacement" if coefficient * float(row[:nx] @ (after - before)) < 0 else None
 
 
 def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTerm]:
@@ -425,10 +383,9 @@ def _values(tried: _Tried, sizes: _Sizes, rows: Matrix) -> Any:
     their places.
     """
     z = tried.choice @ rows / sizes.largest[:, None]
-    shaped = [
-        [one, np.tanh(one / _EDGE) * both, np.abs(one) * both, one**2, one**3]
-        for one, both in zip(z, np.logical_not(sizes.one_sided), strict=True)
-    ]
+    size, turns = np.abs(z), np.logical_not(sizes.one_sided)[:, None]
+    jump, kink, drag = (one * turns for one in (np.tanh(z / _EDGE), size, z * size))
+    shaped = np.stack([z, jump, kink, z**2, z**3, drag], axis=1)
     multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in tried.products]
     beyond = [z - np.clip(z, -w[:, None], w[:, None]) for w in sizes.widths]
     each = (values for own in (*shaped, *beyond) for values in own)
@@ -445,8 +402,7 @@ def _term(
         return MissingTerm(equation, None, "constant", coefficient, share)
     if number < tried.simple:
         variable, shape = divmod(number - 1, len(SHAPES))
-        power = (1, 0, 1, 2, 3)[shape]
-        coefficient /= float(largest[variable]) ** power
+        coefficient /= float(largest[variable]) ** POWERS[shape]
         one_sided = sizes.one_sided[variable]
         return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided)
     number -= tried.simple

@@ -11,7 +11,8 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import join_words, percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.input_timing import LateInput
-from orthaug.analysis.missing_terms import MissingTerm, MissingTest
+from orthaug.analysis.missing_term import MissingTerm
+from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.quantised_output import QuantisedOutput
 from orthaug.analysis.residuals import ResidualTest
