@@ -272,3 +272,32 @@ def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by
     followed = oa.fit_spec(str(spec))
     assert followed.result.scores["train"].simulation.nrmse[0] < 0.02
     assert not any(w.code in ("slow_input", "dead_time") for w in followed.result.warnings)
+
+
+def test_what_a_change_explains_is_called_no_disturbance(tmp_path):
+    """A hardening spring under a low and a high force was a disturbance, and the term in `Next` the remedy."""
+    random, names = np.random.default_rng(12), []
+    for size in (1.2, 9.0):
+        force = np.repeat(random.uniform(-size, size, 76), 12)[:900]
+        q, v, fine, place = 0.0, 0.0, 20, []
+        for u in force:
+            place.append(q)
+            for _ in range(fine):
+                v += 0.02 / fine * (u - 1.5 * v - 80 * q - 9000 * q**3) / 2
+                q += 0.02 / fine * v
+        noise = 0.01 * np.std(place) * random.normal(size=len(place))
+        names.append(f"{size}.csv")
+        data = np.column_stack([force, place + noise])
+        head = "force,position"
+        np.savetxt(tmp_path / names[-1], data, delimiter=",", header=head, comments="")
+    text = MOTION.replace('["run.csv"]', str(names).replace("'", '"')).replace("0.01", "0.02")
+    text = text.replace("initial = 1.0", "initial = 1.5").replace("initial = 2.0", "initial = 1.0")
+    spec = tmp_path / "spec.toml"
+    spec.write_text(text)
+    fitted = oa.fit_spec(str(spec))
+    first = fitted.result.advice[0]
+    assert "the term x**3 in the equation of v" in first.text
+    assert first.after < 0.1 * first.before
+    text = {warning.code: warning.text for warning in fitted.result.warnings}["unexplained"]
+    assert "physics that is missing is its likely cause" in text and first.text in text
+    assert "disturbance" not in text and "noise.model" not in text

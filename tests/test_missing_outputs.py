@@ -236,6 +236,28 @@ def test_init_uses_the_rows_of_a_slow_sensor(project):
     assert run("fit", made, "--out", project / "o").code == 0
 
 
+def test_a_limit_that_the_physics_has_is_no_end_of_a_range():
+    """A controller's limit in the equations was called that of the sensor, and "wrong parameters"."""
+    rng = np.random.default_rng(2)
+    u, x, y = np.repeat(rng.uniform(-2, 2, 40), 15), 0.0, []
+    for value in u:
+        y.append((x, min(max(3 * (value - x), -1.5), 1.5)))
+        x += 0.05 * y[-1][1]
+    y = np.array(y) + [0.002, 0.0] * rng.normal(size=(600, 2))
+    motion = oa.Motion.from_equations(
+        states=[oa.State("x", "a*min(max(k*(u - x), -1.5), 1.5)", start="p")],
+        outputs=[oa.Output("p", "x"), oa.Output("s", "min(max(k*(u - x), -1.5), 1.5)")],
+        inputs=["u"],
+        parameters=[oa.PhysicalParameter(n, v, min=0) for n, v in dict(a=0.8, k=2.5).items()],
+        substeps=1,
+    )
+    record = oa.Record.from_arrays(u, y, sampling_time=0.05, outputs=["p", "s"], inputs=["u"])
+    assert "saturated_output" in {w.code for w in data_warnings(record)}
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    assert found.scores["train"].simulation.nrmse[1] < 0.2
+    assert "saturated_output" not in {w.code for w in found.warnings}
+
+
 def test_a_sensor_whose_range_ends_is_named_and_its_samples_are_marked():
     u, y, _ = signals(rows=1000)
     high = float(np.quantile(y, 0.85))
@@ -247,7 +269,8 @@ def test_a_sensor_whose_range_ends_is_named_and_its_samples_are_marked():
         for w in data_warnings(oa.Record.from_arrays(u, np.round(y, 1), sampling_time=STEP))
         if w.code == "saturated_output"
     ]
-    _, cut = fitted(record)
+    sensor, cut = fitted(record)
+    assert "saturated_output" in {w.code for w in sensor.diagnose().warnings}
     marked = oa.prepare(record, oa.Limits(high=high), missing="keep")
     assert marked.prepared[0].samples == 150
     _, values = fitted(marked)

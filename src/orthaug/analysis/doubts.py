@@ -38,6 +38,7 @@ _NAMED = 12  # parameters in a warning
 _MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judged beside it
 _LITTLE_BESIDE = 0.5  # of that share, which memory must predict
 _LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
+_ONLY = "The 95 % intervals count noise only. "
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
 _UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
 _DETERMINED = re.compile(
@@ -159,14 +160,12 @@ def _noise_only(
 
 
 def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result: Findings) -> str:
-    rows = (*(result.parameters or ()), *(result.physical_parameters or ()))
-    given = any(row.ci95 is not None for row in rows)
-    only = "The 95 % intervals count noise only. " if given else ""
+    given = _has_intervals(result)
+    only = _ONLY if given else ""
     if left > _LEFT:
         what = f"the model's error contains more than noise: {_functions_text(left)}"
     elif test is None or not test.found:
-        what = "the residual contains more than noise"
-        what += " (its verdict is `unmodelled`)" if result.residuals else ""
+        what = _more_than_noise(result)
         if _is_disturbance(fit, result):
             kind = "innovations" if result.motion is not None else "auto"
             return (
@@ -205,6 +204,38 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
         else "Missing physics may have moved the parameters."
     )
     return f"{what}. {moved} {remedy}"
+
+
+def with_found_change(fit: Any, result: Findings, found: str) -> list[Warning]:
+    """Return the warnings after a change of the spec that lowers the error to less than a half.
+
+    One that took what is left for a disturbance refers to the change instead.
+
+    Args:
+        found: the change and its gain, as a sentence.
+    """
+    left = _static_share(result)
+    if left > _LEFT or result.unexplained is not None or not _is_disturbance(fit, result):
+        return list(result.warnings)
+    only = _ONLY if _has_intervals(result) else ""
+    text = (
+        f"{_more_than_noise(result)}, and physics that is missing is its likely cause. {found} "
+        f"{only}Make that change, and fit again."
+    )
+    return [
+        Warning("unexplained", text) if warning.code == "unexplained" else warning
+        for warning in result.warnings
+    ]
+
+
+def _more_than_noise(result: Findings) -> str:
+    verdict = " (its verdict is `unmodelled`)" if result.residuals else ""
+    return f"the residual contains more than noise{verdict}"
+
+
+def _has_intervals(result: Findings) -> bool:
+    rows = (*(result.parameters or ()), *(result.physical_parameters or ()))
+    return any(row.ci95 is not None for row in rows)
 
 
 def _is_disturbance(fit: Any, result: Findings) -> bool:

@@ -33,7 +33,9 @@ from orthaug.analysis.validation import (
     score_trial,
     trials_of,
 )
+from orthaug.data.gaps import saturation_warnings
 from orthaug.data.preparation import of_free_run
+from orthaug.data.record import Record
 from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.estimates import Estimate
@@ -93,6 +95,9 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     if fit.status.ok:
         for part in evidence.parts:
             scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
+    if fit.status.ok:
+        described = _limits_described(evidence.train.record, responses[evidence.train.name][1])
+        warnings = [warning for warning in warnings if warning not in described]
     physics, alone, ran = fit.physics_alone, {}, {}
     if physics is not None and physics.status.ok:
         ran = {part.name: score_part(physics.model, part, []) for part in evidence.parts}
@@ -132,6 +137,14 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     return Examination(
         fit, evidence, result, responses, {name: both for name, (_, both) in ran.items()}
     )
+
+
+def _limits_described(record: Record, free_run: Response) -> list[Warning]:
+    """Return the warnings on limits of outputs that the free run reaches as the data do."""
+    if not record.complete or len(free_run.model) != len(record):
+        return []
+    left = saturation_warnings(record, free_run.model)
+    return [warning for warning in saturation_warnings(record) if warning not in left]
 
 
 def _analyse(

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.special
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
@@ -49,7 +49,9 @@ _RIVAL = 0.9  # of the best term's share, with which another one is named beside
 # Of what the best simple term leaves: a term with the best of many widths is named first below it.
 # Saturations leave 0.2 to 0.6 of what a cube does, cubic springs 0.4 to 1 (missing_terms.py)
 _LESS = 0.6
-_PUSHING = 0.8  # of its gain: friction and drag of the wrong sign are named behind the right one
+# Of its gain, of friction or drag that pushes along a movement, and of drag of no movement: beside
+# a damper the right sign has nearly the same effect, and a cubic spring is nearly a square one
+_UNLIKELY = 0.8
 _CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
@@ -202,38 +204,46 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     if tested is None:
         return None
     p, freedom, share, gains, shares, coefficients, references = tested
-    if tried.count > tried.simple:
-        # Simple terms are tested by themselves, too: the others would take power from them
-        by_term = np.arange(len(gains)) % tried.count < tried.simple
-        alone = _joint_test(found.with_terms(by_term))
-        if alone is not None and alone[0] < p:
-            p, freedom, share = alone[:3]
+    of = np.arange(len(gains)) % tried.count
+    simple = of < tried.simple
+    shape = np.where(simple & (of > 0), (of - 1) % len(SHAPES), -1)
+    # Simple terms are tested by themselves, too: the others would take power from them, and so
+    # would drag, which is nearly made up of their shapes
+    kept = simple & (shape != SHAPES.index("drag"))
+    numbers = np.append(np.cumsum(kept) - 1, -1)[constants][kept]
+    alone = _joint_test(found.with_terms(kept), numbers if simple.all() else None)
+    if alone is not None and (alone[0] < p or simple.all()):
+        p, freedom, share = alone[:3]
+    if not simple.all():
         p = min(2 * p, 1.0)
-        gains = np.where(by_term, gains, _RIVAL * gains)
+        gains = np.where(simple, gains, _RIVAL * gains)
     # Over a range that is small beside the level all shapes are nearly straight
-    straight = (np.arange(len(gains)) % tried.count - 1) % len(SHAPES) == SHAPES.index("linear")
+    straight = shape == SHAPES.index("linear")
     gains = np.where(np.isfinite(references) & ~straight, _CURVED * gains, gains)
-    gains = np.where(_pushes(tried, equations, coefficients), _PUSHING * gains, gains)
-    simple = np.arange(len(gains)) % tried.count < tried.simple
+    own = np.concatenate([_own(tried, motion, equation) for equation in equations])
+    pushes = own * coefficients > 0
+    unlikely = (shape == SHAPES.index("jump")) & pushes
+    unlikely |= (shape == SHAPES.index("drag")) & (pushes | (own == 0))
+    gains = np.where(unlikely, _UNLIKELY * gains, gains)
     named: list[tuple[int, MissingTerm]] = []
     for j in np.argsort(-gains):
         rivals = gains[simple] if simple[j] else gains  # widths are named beside a simple term
         if not gains[j] > _RIVAL * rivals.max():
             continue
-        place, number = divmod(int(j), tried.count)
-        made = (names[equations[place]], number, float(coefficients[j]), float(shares[j]))
+        at, number = divmod(int(j), tried.count)
+        made = (names[equations[at]], number, float(coefficients[j]), float(shares[j]))
         term = _term(tried, sizes[0], *made)
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
-        if equations[place] >= len(motion.states):
+        if equations[at] >= len(motion.states):
             term = replace(term, equation=None, output=term.equation)
         elif not term.factors and term.variable is not None:
             row = tried.choice[tried.names.index(term.variable)]
-            against = _acts_against(fit, equations[place], row, term.coefficient)
+            against = _acts_against(fit, equations[at], row, term.coefficient)
             term = replace(term, against=against)
         if not any(term.curves_like(other) for _, other in named):
-            named.append((place, term))
+            named.append((at, term))
     listed = [term for _, term in named]
     for place, term in named:
         if term.shape in (BEYOND, "cube", "drag") and term.reference is None:
@@ -244,21 +254,12 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     return MissingTest(p, freedom, share, tuple(listed))
 
 
-def _pushes(tried: _Tried, equations: Sequence[int], coefficients: Vector) -> Bool[np.ndarray, "q"]:
-    """Return which terms would push a state along its movement, as no friction and no drag does.
-
-    Beside a damper that is estimated too, the one of the right sign has nearly the same effect.
-    """
-    found = np.zeros((len(equations), tried.count), dtype=bool)
-    signs = coefficients.reshape(found.shape)
-    for i, equation in enumerate(equations):
-        if equation >= tried.choice.shape[1]:
-            continue
-        own = tried.choice[:, equation]
-        for shape in ("jump", "drag"):
-            numbers = 1 + len(SHAPES) * np.arange(len(own)) + SHAPES.index(shape)
-            found[i, numbers] = signs[i, numbers] * own > 0
-    return found.ravel()
+def _own(tried: _Tried, motion: Motion, equation: int) -> Vector:
+    """Return how the variable of each term follows the equation's state; 0 where it does not."""
+    found = np.zeros(tried.count)
+    if equation < len(motion.states):
+        found[1 : tried.simple] = np.repeat(tried.choice[:, equation], len(SHAPES))
+    return found
 
 
 def _acts_against(

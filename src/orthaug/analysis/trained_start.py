@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import singledispatch
 
-import jax
 import numpy as np
 
 from orthaug._base.checks import Matrix
@@ -20,6 +19,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.models.dynamics import Parts, Run
 from orthaug.models.response import Response
 
 _BY_START = 0.5  # of the error's squares: less is left where the measured start made most
@@ -142,7 +142,7 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
         inputs = np.asarray(model.form.inputs(experiment, record))
         bounds = zip(first, [*first[1:], len(experiment)], strict=True)
         pieces = [model.form.run(numbers, own[a], inputs[a:b]) for a, b in bounds]
-        run = pieces[0] if len(pieces) == 1 else jax.tree.map(_joined, *pieces)
+        run = pieces[0] if len(pieces) == 1 else _joined(pieces)
         trajectories.append(model.as_trajectory(run, inputs, experiment, record))
         states.append(np.asarray(run.states))
     if any(one.diverged for one in trajectories):
@@ -154,5 +154,8 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     return TrainedRun(response, begin, remedy, states, segment)
 
 
-def _joined(*pieces: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.asarray(piece) for piece in pieces])
+def _joined(pieces: list[Run]) -> Run:
+    """Return runs one after another as one."""
+    parts = zip(*(piece.parts for piece in pieces), strict=True)
+    states = np.concatenate([np.asarray(piece.states) for piece in pieces])
+    return Run(states, Parts(*(np.concatenate([np.asarray(p) for p in part]) for part in parts)))

@@ -13,7 +13,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug._base.progress import SILENT, Progress, Stage
 from orthaug._base.views import MAKERS
 from orthaug.analysis.attempt import attempt
-from orthaug.analysis.doubts import doubt
+from orthaug.analysis.doubts import doubt, with_found_change
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.examination import Examination, score_and_analyse, was_stopped, with_verdict
 from orthaug.commands import job_result
@@ -24,7 +24,10 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
+    from orthaug.analysis.findings import AdviceResult
     from orthaug.reports.page_fit import Origin
+
+_HALF = 0.5  # of the error, to less than which a change of the spec lowers it: it explains most
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,14 +79,19 @@ def with_advice(fitted: FitReport) -> FitReport:
     found = attempt(
         "the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None
     )
-    warnings = [
-        *fitted.result.warnings,
-        *failed,
-    ]
-    trials = (
-        {"warnings": warnings} if found is None else {"advice": found[0], "advice_trials": found[1]}
-    )
+    advice, tried = ([], None) if found is None else found
+    known = fitted.result.warnings
+    if advice and _explains_most(advice[0]):
+        known = with_found_change(fitted.fit, fitted.result, advice[0].text)
+    trials = {"warnings": [*known, *failed], "advice": advice, "advice_trials": tried}
     return replace(fitted, result=fitted.result.changed(**trials))
+
+
+def _explains_most(advice: AdviceResult) -> bool:
+    """Return whether a change lowers the error to less than a half, or keeps a run bounded."""
+    if advice.after is None:
+        return False
+    return advice.before is None or advice.after < _HALF * advice.before
 
 
 def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.data.columns import Column
@@ -16,6 +16,8 @@ from orthaug.data.record import Experiment, Record, unbroken, without_gaps
 _REGULAR = 0.8  # of the rows that lie in every n-th
 _SHORTEST = 20  # rows of a stretch
 _SATURATED = 0.01  # of the rows, at an extreme value
+_AT_LIMIT = 1e-3  # of the output's deviation: a model so close to an extreme value is there
+_SAME_ROWS = 0.5  # of the rows where data or model are at a limit: both are
 
 
 def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
@@ -71,13 +73,20 @@ def held_warnings(record: Record) -> list[Warning]:
     return found
 
 
-def saturation_warnings(record: Record) -> list[Warning]:
-    """Return a warning of each output that stays at its largest or smallest value for many rows."""
+def saturation_warnings(record: Record, model: Matrix | None = None) -> list[Warning]:
+    """Return a warning of each output that stays at its largest or smallest value for many rows.
+
+    Args:
+        model: a free run's outputs (N, ny) on the rows of a complete record: a limit that it
+            reaches on about the same rows is in the physics, and no warning is due.
+    """
     found = []
     for j, output in enumerate(record.outputs):
         values = record.measured[j]
         limits = Column(output.name, output.name, output.unit, values).limits
         ends = [(value, rows) for value, rows in limits if rows >= _SATURATED * len(values)]
+        if model is not None:
+            ends = [(end, rows) for end, rows in ends if not _has_limit(model[:, j], values, end)]
         if not ends:
             continue
         unit = f" {output.unit}" if output.unit else ""
@@ -96,6 +105,12 @@ def saturation_warnings(record: Record) -> list[Warning]:
         )
         found.append(Warning("saturated_output", text))
     return found
+
+
+def _has_limit(model: Vector, measured: Vector, value: float) -> bool:
+    """Return whether a model stays at an extreme value of what was measured, on about its rows."""
+    there, own = measured == value, np.abs(model - value) <= _AT_LIMIT * np.std(measured)
+    return bool((there & own).sum() > _SAME_ROWS * (there | own).sum())
 
 
 def complete_record(record: Record) -> Record | None:
