@@ -84,7 +84,9 @@ def doubt(made: E) -> E:
         hidden = hidden and test.state.share > _LITTLE_BESIDE * _named_share(result)
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
-    if test is not None and test.drift is not None and not hidden:
+    # What is far from the data, or lacks a term that is known, needs no parameter that changes
+    named = test is None or test.is_far or _named_share(result) > _MOSTLY
+    if test is not None and test.drift is not None and not hidden and not named:
         warnings += _drifting(fit, test.drift)
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:

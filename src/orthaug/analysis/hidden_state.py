@@ -444,6 +444,11 @@ def _structure_of(candidates: Candidates) -> StructureTest | None:
     tests = candidates.test()
     if tests is None:
         return None
+    kinds = (STATIC, *KINDS)
+    if best := best_family([entry for entry in tests.beside if entry.kind in kinds]):
+        # What is missing colours the errors: filtered by their colour little of it is left. Beside
+        # the best family this is the colour of the noise, and shows which of them it is
+        tests = candidates.test(best) or tests
     memory = [entry for entry in tests.beside if entry.kind in KINDS]
     static = best_family([entry for entry in tests.beside if entry.kind == STATIC])
     found = StructureTest(

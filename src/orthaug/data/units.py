@@ -21,6 +21,8 @@ _WRITTEN = {
     "1/min": "rpm",
     "min-1": "rpm",
     "min^-1": "rpm",
+    "C": "degC",  # no channel is in coulombs
+    "F": "degF",
     "m3/h": "m^3/h",
     "m3/s": "m^3/s",
 }
