@@ -105,8 +105,8 @@ def plan_for(job: Job, asked: Asked) -> Plan:
     """
     if job.spec.declared_learner() is None:
         raise InputError(
-            f"{job.path}: has no learner that could take up a missing term; add a [learner], or "
-            'leave out `kind = "none"`.'
+            f"{job.path}: has no learner that could take up a missing term. Add a [learner] with "
+            "its `inputs`; beside a motion also `learned = true` to the equation that may lack one."
         )
     if job.train.source is not None:
         raise InputError(

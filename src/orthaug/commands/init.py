@@ -264,7 +264,7 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
         roles, record, model = _thinned(found, roles, cut, rows, record, model, direct=not fed)
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
-        f"{plural(lost, 'training row')} in longer runs of wild samples "
+        f"{plural(lost, 'training row')} in longer gaps or runs of wild samples "
         f"{'is' if lost == 1 else 'are'} left out"
     )
     gaps = gap_text(missing) if missing else wild if lost else ""

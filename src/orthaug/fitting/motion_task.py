@@ -119,6 +119,12 @@ def _descend_from_others(
                 best = other
     if best is None:
         return None
+    if best is not declared:  # the few iterations of a start may end before the descent does
+        point = best.end.point
+        ended = descend_from(own, solver, [point.theta], None, settled=np.asarray(point.states))
+        if ended is not None and ended.end.point.misfit <= point.misfit:
+            spent = {"iterations": best.iterations + ended.iterations}
+            best = ended._replace(seconds=best.seconds + ended.seconds, **spent)
     after = float(np.sqrt(_squares_at_end(own, best) / own.residuals))
     if declared is None:
         return best._replace(restarted=(None, after))
