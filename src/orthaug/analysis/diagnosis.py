@@ -83,7 +83,8 @@ _SIZABLE = 0.02
 _FEWEST_COMPLETE = 30  # rows with all outputs, to test residuals
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
-_UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
+_UNCOUNTED = "Intervals cover noise only: missing physics may have moved the parameters by more."
+_MOVED = "Missing physics may have moved the parameters."
 
 
 def diagnose(
@@ -209,13 +210,10 @@ def _of_motion(
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
-    warnings += (
-        []
-        if white
-        else [
-            Warning("coloured_residual", colour_sentence(fit) + (_UNCOUNTED if explained else ""))
-        ]
-    )
+    if not white:
+        given = fit.std is not None and bool(np.isfinite(fit.std).any())
+        more = f" {_UNCOUNTED if given else _MOVED}" if explained else ""
+        warnings.append(Warning("coloured_residual", colour_sentence(fit) + more))
     found = (verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
     return Diagnosis(*found, late=late, steps=coarse.steps if coarse else None)
 
