@@ -25,6 +25,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.exchanged_inputs import exchanged_inputs
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
@@ -304,7 +305,9 @@ def _of_lagged(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
     found = _conclude(seen, free_run if free_runs else None)
-    return found if restarted is None else replace(found, warnings=(restarted[1], *found.warnings))
+    more = () if restarted is None else (restarted[1],)
+    more += exchanged_inputs(problem) if found.verdict == "unmodelled" else ()
+    return replace(found, warnings=(*more, *found.warnings))
 
 
 def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
