@@ -56,6 +56,8 @@ ENTRIES = {
     "commands.": "a command, or a part of the page, has a file of its own",
 }
 CONCEPTS = {
+    "data.angles": "angles that wrap",
+    "data.units": "units, read by a library",
     "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
     "physics.fmu": "a kind of source",
@@ -64,7 +66,6 @@ CONCEPTS = {
     "physics.model_exchange": "the interface FMI",
     "analysis.contraction": "a norm in which a free run forgets its start",
     "analysis.exchanged_inputs": "a mistake in the spec that the data show",
-    "analysis.filtered_rows": "errors of a free run, filtered until noise in them is white",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",

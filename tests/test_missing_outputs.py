@@ -280,3 +280,4 @@ def test_a_sensor_whose_range_ends_is_named_and_its_samples_are_marked():
         oa.Limits()
     with pytest.raises(oa.InputError, match="`high`|high"):
         oa.Limits(high=float("nan"))
+    assert oa.Limits(low=-5.0).low == -5

@@ -18,7 +18,6 @@ from orthaug.analysis.verdict_text import describe_colour, small_effects
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.conclusion import reopen_estimate
 from orthaug.fitting.field_points import field_under
-from orthaug.fitting.motion_estimate import fitted_numbers
 from orthaug.inference.splitting import nearest, shared_of_motion
 from orthaug.models.learners import Bound
 from orthaug.models.motion_field import parts_at
@@ -197,7 +196,7 @@ def test_a_split_under_another_measure_moves_only_what_is_shared(fitted: oa.Moti
 
 def test_standard_errors_of_a_split_are_those_of_its_slope(fitted: oa.MotionEstimate) -> None:
     """∂q̂/∂(c, w) against differences of the whole split, the trajectories moved with the unknowns."""
-    segmented, numbers = fitted.segmented, fitted_numbers(fitted.model.numbers)
+    segmented, numbers = fitted.segmented, fitted.model.numbers.unsplit
     unknowns = np.concatenate([numbers.theta, numbers.weights])
     bounds = fitted.problem.motion.coordinates.bounds
     size = fitted.split_by.field.size

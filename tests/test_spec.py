@@ -172,6 +172,26 @@ def test_a_part_may_be_the_name_of_its_file(tmp_path, train, files):
     assert spec.data.train.files == files
 
 
+MOTION = """
+[motion.states]
+x = { derivative = "-a*x + u", start = "y" }
+[motion.outputs]
+y = "x"
+[motion.parameters]
+a = { initial = 1.0 }
+"""
+
+
+@pytest.mark.parametrize("segment", [8, 32, 40, 41])
+def test_a_segment_may_be_shorter_than_the_usual_washout(tmp_path, segment):
+    training = f'[training]\nfocus = "simulation"\nsegment = {segment}\n'
+    lagged = load_spec(put(tmp_path, LEAST + training)).declared_criterion()
+    assert (lagged.segment, lagged.washout) == (segment, segment // 4 if segment <= 40 else 40)
+    data = LEAST[: LEAST.index("[[baseline")]
+    motion = load_spec(put(tmp_path, data + MOTION + training)).declared_criterion()
+    assert (motion.segment, motion.washout) == (segment, 0)
+
+
 def test_without_inputs_with_a_time_column_and_without_a_learner(tmp_path):
     text = (
         edited(LEAST, 'inputs = ["u"]', 'inputs = []\ntime = "t"')

@@ -673,7 +673,7 @@ def test_robust_errors_of_a_split_come_from_the_influence_of_every_row(noisy):
         noisy.model.predict(noisy.problem.record).trajectories[0].model - noisy.problem.rows.y
     ) * -1
     problem, used = noisy.problem, noisy.effective_weights
-    found = robust_split_covariance(problem, noisy.model, noisy._slope(), residual, used)
+    found = robust_split_covariance(problem, noisy.model, noisy.moves_by()[0], residual, used)
     np.testing.assert_allclose(found, noisy.robust().covariance, rtol=1e-6)
     moved = other("split")
     np.testing.assert_allclose(moved.robust().std, moved.std, rtol=0.3)

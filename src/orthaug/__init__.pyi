@@ -37,6 +37,7 @@ from .data.preparation import Lowpass as Lowpass
 from .data.steps import Limits as Limits
 from .data.steps import Repeats as Repeats
 from .data.steps import Shift as Shift
+from .data.steps import Unwrap as Unwrap
 from .export import export as export
 from .export import numpy_step as numpy_step
 from .fitting import Additive as Additive

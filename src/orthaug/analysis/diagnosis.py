@@ -155,12 +155,12 @@ def _of_motion(
         free_run = one_step or fit.model.predict(fit.problem.record)
     free_run = fit.model.simulate(fit.problem.record) if free_run is None else free_run
     record, motion = fit.problem.record, fit.problem.motion
-    if any(run.diverged for run in free_run.trajectories):
-        return None
     if np.all(rms_errors(free_run) / fit.problem.deviation < ROUNDING):
         return None
     restarted = from_trained_start(fit, free_run)
     free_run = free_run if restarted is None else restarted[0].response
+    if any(run.diverged for run in free_run.trajectories):
+        return None
     coarse = quantised_output(fit, free_run)
     errors = errors_of(free_run) if coarse is None else coarse.left
     firsts = [run.start for run in free_run.trajectories]

@@ -53,6 +53,7 @@ def doubt(made: E) -> E:
     Its intervals are marked with what they count.
     """
     from orthaug.analysis.hidden_state import structure_test  # slow to import
+    from orthaug.analysis.trained_start import judged_record
 
     fit, result = made.fit, made.result
     if not fit.status.ok:
@@ -61,7 +62,7 @@ def doubt(made: E) -> E:
     failed: list[Any] = []
     test = attempt(
         "the search for a hidden state",
-        lambda: structure_test(fit.model, fit.problem.record),
+        lambda: structure_test(fit.model, judged_record(fit)),
         failed,
         None,
     )

@@ -55,6 +55,7 @@ _FINDINGS = (
     "stability",
     "measure_detail",
 )
+_OF_UNSTABLE = ("free_run_diverges", "growing_mode")  # what `unstable_plant` says better
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +115,8 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
         judged = partial(explains_nothing, part=evidence.train, parameters=estimated, driven=driven)
         other = from_trained_start(fit, run) if judged(run) else None
         warnings += judged(run if other is None else other[0].response)
+    if any(warning.code == "unstable_plant" for warning in warnings):
+        warnings[:] = [warning for warning in warnings if warning.code not in _OF_UNSTABLE]
     if fit.status.ok and fields["residuals"] is not None:
         fit = _for_observers(fit, fields["residuals"].verdict, warnings)
     content = fields | {

@@ -368,12 +368,10 @@ def linearize_fit(fit: MotionEstimate) -> MotionTerms | None:
 
     None where it has no normal equations, or where the gain of a predictor would move with them.
     """
-    if not fit.status.ok or fit.scores is None or fit.model.coloured:
+    place = FreeRunPoint.of(fit)
+    if not fit.status.ok or place is None or fit.model.coloured:
         return None
-    numbers, field, learned = fit.model.numbers, fit.split_by.field, None
-    ridge = fit.model.statistics.ridge / fit.scores.unit
-    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
-    place = FreeRunPoint(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
+    field, learned = fit.split_by.field, None
     if fit.learns:
         learned = parts_at(fit.model.form, fit.model.numbers, field.x, field.u)[1]
         learned = np.where(np.isfinite(learned), learned, 0.0)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, jax, jnp, quick_jit
-from orthaug.fitting.motion_estimate import MotionEstimate, free_covariance
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.inference.covariance import reach
 from orthaug.inference.splitting import rest_of
 from orthaug.models.dynamics import Numbers
@@ -58,7 +58,7 @@ def learned_reach(fit: MotionEstimate, x: Matrix, u: Matrix) -> Matrix | None:
     None without intervals, and where some parameter is not identified: the prior of the weights
     then holds both.
     """
-    made, slope = free_covariance(fit), fit.split_by.slope
+    made, slope = fit.free_covariance(), fit.split_by.slope
     if made is None or slope is None or fit.unidentified:
         return None
     joint, moves = made

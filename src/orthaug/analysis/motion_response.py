@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -35,6 +36,7 @@ from orthaug.fitting.segments import Segments, packed, respond, sensitivity, sen
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.moving import MotionDynamics
+from orthaug.models.statistics import prior_of
 from orthaug.physics.motion import MOST_SUBSTEPS
 from orthaug.physics.suspected_motion import SuspectedMotion, SuspectedTerm
 
@@ -58,6 +60,53 @@ class FreeRunPoint:
     """(ny, ny), multiplies errors."""
     ridge: float | Vector = 0.0
     """On the weights, in the unit of the weighted errors."""
+
+    @classmethod
+    def of(cls, fit: MotionEstimate) -> FreeRunPoint | None:
+        """Return the point at which training ended; None without normal equations."""
+        if fit.scores is None:
+            return None
+        c, w = np.asarray(fit.model.numbers.c), np.asarray(fit.model.numbers.weights)
+        ridge = fit.model.statistics.ridge / fit.scores.unit
+        return cls(fit.segmented, c, w, fit.states, fit.scores.weight, ridge)
+
+    @property
+    def inside(self) -> Bool[np.ndarray, "np"]:
+        """Mask of the coordinates that are not at a bound."""
+        return self.segmented.problem.motion.coordinates.inside(self.c)
+
+    @property
+    def start_rows(self) -> Matrix:
+        """L of the guesses of the starts."""
+        return LOOSER * self.segmented.objective().start_rows
+
+    def respond(self, c: Vector, w: Vector) -> Any:
+        """Return the outputs (k, T, ny, m) of the free run from the same starts, for any (c, w)."""
+        run = self.segmented
+        return respond(run.dynamics, run.numbers(c, w), run.segments, self.states)
+
+    def moved_by(self, outputs: Float[np.ndarray, "k T ny m"]) -> Vector | None:
+        """Return by how much (c, w) move with what `outputs` differ from the free run.
+
+        That is `(SᵀS + ridge)⁻¹SᵀΔy`, to first order; a coordinate at its bound does not move. None
+        where the information is not finite.
+
+        Args:
+            outputs: those of the free run over the segments, with an effect on them.
+        """
+        segmented, at = self.segmented, np.asarray(self.states)
+        moved = segmented.segments._replace(target=outputs)
+        numbers = segmented.numbers(self.c, self.w)
+        slopes = sensitivity(segmented.dynamics, numbers, moved, at, self.weight)
+        starts = InitialStates(at, free=True)
+        information, gradient = starts.eliminate(slopes, at, self.start_rows)[:2]
+        if not np.isfinite(information).all() or not np.isfinite(gradient).all():
+            return None
+        free = np.concatenate([self.inside, np.ones(len(self.w), dtype=bool)])
+        penalised = information + np.diag(prior_of(information, self.ridge, len(self.c)))
+        step = np.zeros(len(free))
+        step[free] = solve_scaled(penalised[np.ix_(free, free)], gradient[free])
+        return step
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +155,8 @@ class TermsResponse:
     @property
     def penalised(self) -> Matrix:
         """The information with the ridge."""
-        ridge = np.zeros(len(self.fitted))
-        ridge[self.parameters + self.terms :] = self.place.ridge
-        return self.information + np.diag(ridge)
+        nt = self.parameters + self.terms
+        return self.information + np.diag(prior_of(self.information, self.place.ridge, nt))
 
     def held(self, dw: Vector, x: Matrix, u: Matrix) -> Matrix:
         """Return the learner's change (M, nl) by a change of weights, at x (M, nx), u (M, nu)."""
@@ -196,12 +244,11 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
     form = replace(segmented.dynamics, motion=suspected, bound=bound)
     numbers = segmented.numbers(np.concatenate([place.c, np.zeros(len(added))]), w)
     slopes = sensitivity_once(form, numbers, segmented.segments, place.states, place.weight)
-    objective = segmented.objective()
-    rows = LOOSER * objective.start_rows
-    information, gradient, _, slope = objective.initial.eliminate(slopes, place.states, rows)
-    low, high = motion.coordinates.bounds
-    inside = (low < place.c) & (place.c < high)
-    fitted = np.concatenate([inside, np.zeros(len(added), dtype=bool), np.ones(len(w), dtype=bool)])
+    initial = segmented.objective().initial
+    information, gradient, _, slope = initial.eliminate(slopes, place.states, place.start_rows)
+    fitted = np.concatenate(
+        [place.inside, np.zeros(len(added), dtype=bool), np.ones(len(w), dtype=bool)]
+    )
     own = (information, gradient, slope, fitted, len(added), segmented.segments)
     return TermsResponse(place, form, numbers, *own)
 
@@ -276,62 +323,23 @@ def substep_bias(fit: MotionEstimate) -> SubstepBias | None:
         p̂ less what a fit with twice the substeps would give, to first order, in the units of p and
         in standard errors.
     """
-    motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
-    substeps = segmented.dynamics.substeps
+    motion, place = fit.problem.motion, FreeRunPoint.of(fit)
+    substeps = fit.segmented.dynamics.substeps
     if (
         motion.scheme.discrete
-        or fit.scores is None
+        or place is None
         or fit.split_by.slope is None
         or 2 * substeps > MOST_SUBSTEPS
     ):
         return None
-    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
-    finer = segmented.with_substeps(2 * substeps)
-    outputs = respond(finer.dynamics, finer.numbers(c, w), finer.segments, fit.states)
-    step = coordinates_moved(fit, outputs)
+    finer = replace(place, segmented=fit.segmented.with_substeps(2 * substeps))
+    step = place.moved_by(finer.respond(place.c, place.w))
     if step is None:
         return None
-    value = parameters_moved(fit, step)
+    value = fit.moved_by(step)
     errors = np.abs(value) / np.where(fit.known_std > 0, fit.known_std, np.nan)
     found = SubstepBias(motion.names, substeps, value, errors)
     return replace(found, warnings=_warnings(found, fit))
-
-
-def coordinates_moved(fit: MotionEstimate, outputs: Float[np.ndarray, "k T ny m"]) -> Vector | None:
-    """Return by how much a fit's (c, w) move with what `outputs` differ from its free run.
-
-    That is `(SᵀS + ridge)⁻¹SᵀΔy`, to first order; a coordinate at its bound does not move. None
-    where the information is not finite, or the fit has no normal equations.
-
-    Args:
-        outputs: those of the free run over the segments, with an effect on them.
-    """
-    motion, segmented, numbers = fit.problem.motion, fit.segmented, fit.model.numbers
-    if fit.scores is None:
-        return None
-    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
-    moved = segmented.segments._replace(target=outputs)
-    slopes = sensitivity(
-        segmented.dynamics, segmented.numbers(c, w), moved, fit.states, fit.scores.weight
-    )
-    rows = LOOSER * segmented.objective().start_rows
-    at = np.asarray(fit.states)
-    information, gradient = InitialStates(at, free=True).eliminate(slopes, at, rows)[:2]
-    if not np.isfinite(information).all() or not np.isfinite(gradient).all():
-        return None
-    low, high = motion.coordinates.bounds
-    free = np.concatenate([(low < c) & (c < high), np.ones(len(w), dtype=bool)])
-    information = information + np.diag(
-        np.concatenate([0 * c, fit.model.statistics.ridge / fit.scores.unit + 0 * w])
-    )
-    step = np.zeros(len(free))
-    step[free] = solve_scaled(information[np.ix_(free, free)], gradient[free])
-    return step
-
-
-def parameters_moved(fit: MotionEstimate, step: Vector) -> Vector:
-    """Return by how much p̂ (np,) moves with a step of (c, w): the learner's split counts."""
-    return fit.problem.motion.coordinates.slopes(fit.theta) * (fit.split_by.slope @ step)
 
 
 def _warnings(found: SubstepBias, fit: MotionEstimate) -> tuple[Warning, ...]:

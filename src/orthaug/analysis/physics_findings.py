@@ -26,6 +26,7 @@ from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.analysis.motion_response import substep_bias
 from orthaug.analysis.other_solutions import find_other_solution
+from orthaug.analysis.trained_start import judged_record
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
@@ -226,8 +227,9 @@ def _of_motion(
     free_run: Response,
     warnings: list[Warning],
 ) -> dict[str, Any]:
-    record = fit.problem.record
-    x, u = np.split(fit.reach(record), [fit.model.form.states], axis=1)
+    record, judged = fit.problem.record, judged_record(fit)
+    x, u = np.split(fit.reach(judged), [fit.model.form.states], axis=1)
+    bounded = record if judged is record else None  # no run of an unstable plant is bounded
     found: dict[str, Any] = {
         "residuals": attempt_warned(
             "the analysis of the residual",
@@ -237,7 +239,7 @@ def _of_motion(
         ),
         "stability": attempt_warned(
             "the analysis of the modes",
-            lambda: motion_stability(fit.model, x, u, record=record),
+            lambda: motion_stability(fit.model, x, u, record=bounded),
             warnings,
         ),
     }

@@ -18,12 +18,11 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.jax import AnyArray
 from orthaug._base.lines import join_words, percent
-from orthaug.analysis.motion_response import coordinates_moved, parameters_moved
+from orthaug.analysis.motion_response import FreeRunPoint
 from orthaug.analysis.residuals import errors_of, rms_errors
 from orthaug.data.columns import quantum_of
 from orthaug.data.record import Record
 from orthaug.fitting.motion_estimate import MotionEstimate
-from orthaug.fitting.segments import respond
 from orthaug.models.response import Response
 
 _WAYS: Mapping[str, tuple[str, Callable[[AnyArray], AnyArray]]] = {
@@ -76,7 +75,8 @@ def quantised_output(fit: MotionEstimate, free_run: Response) -> QuantisedOutput
     Args:
         free_run: of the model over the training data.
     """
-    if fit.model.coloured or fit.scores is None or fit.split_by.slope is None:
+    place = FreeRunPoint.of(fit)
+    if fit.model.coloured or place is None or fit.split_by.slope is None:
         return None
     record = fit.problem.record
     if not record.complete:
@@ -87,17 +87,22 @@ def quantised_output(fit: MotionEstimate, free_run: Response) -> QuantisedOutput
     found = [
         tried
         for way in _WAYS
-        if (tried := _explain_by(way, fit, free_run, quanta, first)) is not None
+        if (tried := _explain_by(way, fit, place, free_run, quanta, first)) is not None
     ]
     best = max(found, key=lambda tried: tried.share, default=None)
     return best if best is not None and best.share > _MOST else None
 
 
 def _explain_by(
-    way: str, fit: MotionEstimate, free_run: Response, quanta: Vector, levels: Vector
+    way: str,
+    fit: MotionEstimate,
+    place: FreeRunPoint,
+    free_run: Response,
+    quanta: Vector,
+    levels: Vector,
 ) -> QuantisedOutput | None:
     """Return what a way of recording explains and moves; None where a free run fails."""
-    segmented, numbers, weight = fit.segmented, fit.model.numbers, fit.problem.deviation
+    segmented, weight = fit.segmented, fit.problem.deviation
     coarse = quanta > 0
 
     def error(y: AnyArray, axis: int) -> AnyArray:
@@ -110,21 +115,15 @@ def _explain_by(
         recorded = zero + q * _WAYS[way][1]((y - zero) / q)
         return np.where(coarse.reshape(shape), recorded - y, 0.0)
 
-    c, w = np.asarray(numbers.c), np.asarray(numbers.weights)
+    c, w = place.c, place.w
     step = np.zeros(len(c) + len(w))
-    at_fit = np.asarray(
-        respond(segmented.dynamics, segmented.numbers(c, w), segmented.segments, fit.states)
-    )
+    at_fit = np.asarray(place.respond(c, w))
     low, high = fit.problem.motion.coordinates.bounds
     with np.errstate(all="ignore"):
         for _ in range(_REPEATS):
             here = np.clip(c - step[: len(c)], low, high), w - step[len(c) :]
-            y = np.asarray(
-                respond(
-                    segmented.dynamics, segmented.numbers(*here), segmented.segments, fit.states
-                )
-            )
-            step = coordinates_moved(fit, at_fit + error(y, -2))
+            y = np.asarray(place.respond(*here))
+            step = place.moved_by(at_fit + error(y, -2))
             if step is None or not np.isfinite(step).all():
                 return None
         here = np.clip(c - step[: len(c)], low, high), w - step[len(c) :]
@@ -136,7 +135,7 @@ def _explain_by(
         return None
     outputs = [channel.name for channel in fit.problem.record.outputs]
     steps = {outputs[i]: float(quanta[i]) for i in np.flatnonzero(coarse)}
-    shift, share = parameters_moved(fit, step), float(1 - squares / before)
+    shift, share = fit.moved_by(step), float(1 - squares / before)
     warning = _warning(fit, steps, way, share, shift)
     return QuantisedOutput(steps, way, share, left, shift, warning)
 

@@ -13,7 +13,6 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
-from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
@@ -42,9 +41,7 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
     moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
     prediction of the training rows. With a noise model they are plain: those of its innovations.
     """
-    if not isinstance(fit, LaggedEstimate):
-        return robust_free_run(fit)
-    if not fit.status.ok or fit.covariance is None or fit.at_bound or fit.model.coloured:
+    if not fit.status.ok or fit.covariance is None or not fit.robust_kinds:
         return fit
     if fit.criterion.free_run is not None:
         return robust_free_run(fit)
@@ -121,10 +118,8 @@ def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return False
     k, moves = made
-    statistics = fit.model.statistics
     nt = len(fit.theta)
-    prior = np.broadcast_to(statistics.ridge, len(statistics.gram) - nt)[moves[nt:]]
-    own = replace(statistics, gram=statistics.gram[np.ix_(moves, moves)], ridge=prior)
+    own = fit.model.statistics.among(moves, nt)
     with one_blas_thread():
         return (
             Influence.of(slopes[..., moves], own, k[:, moves], int(moves[:nt].sum())).uneven(errors)
@@ -171,7 +166,7 @@ def _withheld(fit: Any) -> Any:
     )
 
 
-def _memory(fit: LaggedEstimate, response: Response) -> int | None:
+def _memory(fit: Estimate, response: Response) -> int | None:
     """Return lags for the one-step residual; None where it is white, or rounding."""
     memory = 0
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import Array, padded_length, quick_jit
-from orthaug.fitting.motion_estimate import MotionEstimate, fitted_numbers
+from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 
@@ -72,7 +72,7 @@ def sensitivities(
         terms: makes the terms, given the points (n, M) of the runs.
         count: of terms.
     """
-    segmented, numbers = fit.segmented, fitted_numbers(fit.model.numbers)
+    segmented, numbers = fit.segmented, fit.model.numbers.unsplit
     form = segmented.dynamics
     # (k, m, T, n0)
     runs = np.moveaxis(segmented.runs(numbers.theta, numbers.weights, fit.states), -1, 1)

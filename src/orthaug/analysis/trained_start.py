@@ -15,9 +15,11 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug.analysis.output_response import from_fitted_start
 from orthaug.analysis.residuals import rms_errors
+from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.models.dynamics import Parts, Run
 from orthaug.models.response import Response
 
 _BY_START = 0.5  # of the error's squares: less is left where the measured start made most
@@ -28,13 +30,15 @@ class TrainedRun:
     """A free run over the training data from the start that training found.
 
     `begin` says what the other run starts from, `states` are the run's (N, nx) of each experiment
-    where they are not outputs.
+    where they are not outputs. The run of an unstable plant starts anew after every `segment`
+    steps.
     """
 
     response: Response
     begin: str
     remedy: str
     states: list[Matrix] | None = None
+    segment: int = 0
 
 
 def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, Warning] | None:
@@ -45,10 +49,14 @@ def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, W
     Args:
         free_run: over the training data, from the measured start.
     """
-    if not fit.criterion.simulates or any(run.diverged for run in free_run.trajectories):
+    if not fit.criterion.simulates:
         return None
     other = _trained_run(fit, free_run)
     if other is None:
+        return None
+    if other.segment:
+        return other, _unstable(other.segment, fit.problem.record.sampling_time)
+    if any(run.diverged for run in free_run.trajectories):
         return None
     before, after = rms_errors(free_run), rms_errors(other.response)
     unit = fit.problem.deviation
@@ -64,6 +72,44 @@ def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, W
         f"the better one. Judge the model by the latter, or give `simulate` {other.remedy}."
     )
     return other, Warning("noisy_start", text)
+
+
+def _unstable(segment: int, step: float) -> Warning:
+    text = (
+        f"the plant is unstable: errors of a free run grow twenty-fold in about {segment} samples "
+        f"({segment * step:.3g} s), so none follows the record. Training and the tests of the "
+        "residual use runs of that length from estimated starts. Scores of whole free runs mean "
+        "nothing: judge the model by its predictions. If a controller held the plant, give "
+        "`controller` and the reference as input."
+    )
+    return Warning("unstable_plant", text)
+
+
+def judged_record(fit: Estimate) -> Record:
+    """Return the training data in experiments over which a free run is judged.
+
+    Those of an unstable plant are its segments.
+    """
+    begins = _begins(fit) if isinstance(fit, MotionEstimate) else None
+    record = fit.problem.record
+    if begins is None:
+        return record
+    pieces = [
+        experiment.rows(first, last)
+        for experiment, own in zip(record.experiments, begins, strict=True)
+        for first, last in zip(own, [*own[1:], len(experiment)], strict=True)
+    ]
+    return replace(record, experiments=tuple(pieces))
+
+
+def _begins(fit: MotionEstimate) -> list[list[int]] | None:
+    """Return the first rows of the segments of an unstable plant; None of a stable one."""
+    segmented = fit.segmented
+    values = np.asarray(fit.problem.values_at(np.asarray(fit.theta)), dtype=float)
+    whole = all(len(own) == 1 for own in segmented.begins)
+    if whole or fit.model.coloured or not fit.problem.steps_to_leave(values):
+        return None
+    return segmented.begins
 
 
 @singledispatch
@@ -90,13 +136,26 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     numbers = model.numbers
     rows = fit.segmented.states_by_row(np.asarray(numbers.c), numbers.weights, fit.states)
     trajectories, states = [], []
-    for experiment, own in zip(record.experiments, rows, strict=True):
-        inputs = model.form.inputs(experiment, record)
-        run = model.form.run(numbers, own[0], inputs)
+    begins = _begins(fit)
+    each = [[0]] * len(rows) if begins is None else begins
+    for experiment, own, first in zip(record.experiments, rows, each, strict=True):
+        inputs = np.asarray(model.form.inputs(experiment, record))
+        bounds = zip(first, [*first[1:], len(experiment)], strict=True)
+        pieces = [model.form.run(numbers, own[a], inputs[a:b]) for a, b in bounds]
+        run = pieces[0] if len(pieces) == 1 else _joined(pieces)
         trajectories.append(model.as_trajectory(run, inputs, experiment, record))
         states.append(np.asarray(run.states))
     if any(one.diverged for one in trajectories):
         return None
     begin = "the state that its first rows give, and the model remembers the error of that"
     remedy = "more rows to start from (--initial)"
-    return TrainedRun(replace(free_run, trajectories=tuple(trajectories)), begin, remedy, states)
+    response = replace(free_run, trajectories=tuple(trajectories))
+    segment = 0 if begins is None else fit.segmented.segments.steps
+    return TrainedRun(response, begin, remedy, states, segment)
+
+
+def _joined(pieces: list[Run]) -> Run:
+    """Return runs one after another as one."""
+    parts = zip(*(piece.parts for piece in pieces), strict=True)
+    states = np.concatenate([np.asarray(piece.states) for piece in pieces])
+    return Run(states, Parts(*(np.concatenate([np.asarray(p) for p in part]) for part in parts)))

@@ -26,7 +26,6 @@ from orthaug.commands.sections import (
 from orthaug.data.preparation import STEPS
 from orthaug.data.record import LONGEST_STEP
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.kinds import CRITERIA
 from orthaug.fitting.noise import OF_LAGGED
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_states
@@ -41,6 +40,13 @@ if TYPE_CHECKING:
 _PARQUET = ".parquet"
 _SHARE = 0.25  # of the memory that is free: what the files may take before they are streamed
 _COPIES = 4  # of a file's bytes, in a fit in memory at least
+_BESIDE_MOTION = {
+    "baseline": "expected one of them, because both are the physics",
+    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
+    "inputs of its learner",
+    "physics": "expected none, because the parameters of a motion are physical: "
+    "[motion.parameters]",
+}
 Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 Text = Annotated[str, Field(min_length=1)]
 
@@ -281,8 +287,36 @@ class MotionSection(KindSection):
         A motion is trained on its free run, from starts that are estimated: without a washout.
         """
         focus = "simulation" if training.focus == "auto" else training.focus
-        washout = {} if "washout" in training.model_fields_set else {"washout": 0}
-        return resolve(training.model_copy(update=washout).declared(CRITERIA, focus))
+        return resolve(training.declared_criterion(focus, washout=0))
+
+    def check_beside(self, spec: Any) -> None:
+        """Raise ValueError for what a spec cannot have beside these physics."""
+        for name in ("states", "outputs", "parameters"):
+            if self.source is None and name not in self.model_fields_set:
+                raise ValueError(f"the key 'motion.{name}' is missing")
+        for name, expected in _BESIDE_MOTION.items():
+            if name in spec.model_fields_set:
+                raise ValueError(f"`{name}`: found beside [motion]; {expected}")
+        if spec.data.missing == "keep":
+            self._check_missing(spec)
+        if spec.training.ensemble:
+            raise ValueError(
+                "`training.ensemble`: a motion has none, because medians of runs follow no "
+                "equations"
+            )
+
+    def _check_missing(self, spec: Any) -> None:
+        """Raise ValueError for what reads the outputs of every row."""
+        if spec.noise.model != "white":
+            raise ValueError(
+                '`data.missing`: found "keep"; a predictor of `noise.model` needs every row: '
+                '"white"'
+            )
+        if spec.engine.kind not in ("auto", "memory"):
+            raise ValueError(
+                '`data.missing`: found "keep"; rows must be in memory for it: `engine.kind` = '
+                '"memory"'
+            )
 
     def check_noise(self, spec: Any, found: str) -> None:
         """Raise ValueError for a noise model that a spec cannot have, which was `found`."""

@@ -24,6 +24,7 @@ from orthaug.data.readers import read_record
 from orthaug.data.record import Record, same_step
 from orthaug.data.sources import witness
 from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
+from orthaug.data.units import unit_warnings
 from orthaug.reports.result import FileResult
 
 
@@ -220,6 +221,7 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             Warning("thinned", f"{kept}; content above the new Nyquist frequency is aliased."),
         )
     warnings += _guessed_encoding(path, files, name)
+    warnings += _other_units(path, spec, files, name, part.columns)
     if spec.data.time is None:
         warnings += _other_step(path, spec, files, name, part.columns)
     if not record.even:
@@ -271,9 +273,9 @@ def _open_in_files(
     record = replace(
         record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments)
     )
-    total, warnings = sum(rows.values()), ()
+    total, warnings = sum(rows.values()), _other_units(path, spec, files, name, part.columns)
     if spec.data.time is None:
-        warnings = _other_step(path, spec, files, name, part.columns)
+        warnings += _other_step(path, spec, files, name, part.columns)
     if len(record) < total:
         text = (
             f"{name}: findings and figures use {len(record)} of {total} rows, in windows "
@@ -311,6 +313,22 @@ def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warn
             )
             return (Warning("encoding_guessed", text),)
     return ()
+
+
+def _other_units(
+    path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
+) -> tuple[Warning, ...]:
+    """Return the warnings of the first file whose headers have other units than the channels.
+
+    A test in a file of the training data repeats none.
+    """
+    known = expand_files(path, spec.data.train.files, "train") if name != "train" else ()
+    channels = {
+        columns.get(channel.name, channel.file_column): channel
+        for channel in (*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs))
+    }
+    found = (unit_warnings(path.parent / file, channels) for file in files if file not in known)
+    return tuple(next((warnings for warnings in found if warnings), []))
 
 
 def _other_step(

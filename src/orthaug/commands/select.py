@@ -156,7 +156,7 @@ def _largest_orders(spec: Spec) -> Lags | None:
 def _criterion(spec: Spec) -> Criterion:
     """Return the declared criterion; the free run where the spec has none."""
     focus = "simulation" if spec.training.focus == "auto" else spec.training.focus
-    return spec.training.declared(CRITERIA, focus)
+    return spec.training.declared_criterion(focus)
 
 
 def _result(job: Job, selection: Selection, seconds: float) -> SelectResult:

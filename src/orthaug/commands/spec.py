@@ -74,13 +74,6 @@ _SECTIONS = {  # of keys that are not in [training]
     "states": "learner.states",
     "kind": "structure.kind",
 }
-_BESIDE_MOTION = {
-    "baseline": "expected one of them, because both are the physics",
-    "lags": "expected none, because a motion has states instead; `learner.inputs` declares the "
-    "inputs of its learner",
-    "physics": "expected none, because the parameters of a motion are physical: "
-    "[motion.parameters]",
-}
 
 
 class LagsSection(Section):
@@ -140,7 +133,21 @@ class BaselineSection(Section):
 
     def criterion(self, training: TrainingSection) -> Criterion:
         """Return the criterion of a spec."""
-        return resolve(training.declared(CRITERIA, training.chosen_focus()))
+        return resolve(training.declared_criterion(training.chosen_focus()))
+
+    def check_beside(self, spec: Spec) -> None:
+        """Raise ValueError for what a spec cannot have beside these physics."""
+        if spec.controller is not None:
+            raise ValueError(
+                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
+                'one with `integrator` = "discrete", or leave it out and estimate one step '
+                'ahead with `noise.model` = "arma"'
+            )
+        if spec.data.missing == "keep":
+            raise ValueError(
+                '`data.missing`: found "keep"; lagged physics needs the outputs of every row. '
+                'Leave rows out by "skip", or state the physics as a [motion]'
+            )
 
     def check_noise(self, spec: Spec, found: str) -> None:
         """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
@@ -256,11 +263,24 @@ class TrainingSection(KindSection):
         check_starts(self.restarts, self.seed, ensemble=self.ensemble)
         solver, criterion = (
             self.declared(SOLVERS, self.solver),
-            self.declared(CRITERIA, self.chosen_focus()),
+            self.declared_criterion(self.chosen_focus()),
         )
         given = self.regularization
         check_solver(solver, criterion, given if isinstance(given, list) else [given])
         return self
+
+    def declared_criterion(self, focus: str, washout: int | None = None) -> Criterion:
+        """Return the criterion of a focus, for physics whose free runs have this washout.
+
+        Where the section gives none and segments are as short as the usual washout or shorter, it
+        is a quarter of them.
+        """
+        segment: Any = getattr(self, "segment", "auto")
+        short = isinstance(segment, int) and 0 < segment <= getattr(self, "washout", 0)
+        own = segment // 4 if short and washout is None else washout
+        given = own is None or "washout" in self.model_fields_set
+        section = self if given else self.model_copy(update={"washout": own})
+        return section.declared(CRITERIA, focus)
 
     def chosen_focus(self) -> str:
         """Return the focus of training.
@@ -359,49 +379,16 @@ class Spec(Section):
 
     @model_validator(mode="after")
     def _one_physics(self) -> Spec:
-        for name in ("states", "outputs", "parameters"):
-            motion = self.motion
-            if motion is not None and motion.source is None and name not in motion.model_fields_set:
-                raise ValueError(f"the key 'motion.{name}' is missing")
         if self.motion is None and self.baseline is None:
             raise ValueError(
                 "the key 'baseline' is missing; expected [[baseline.terms]], or a [motion] instead"
             )
-        for name in ("baseline", "lags", "physics") if self.motion is not None else ():
-            if name in self.model_fields_set:
-                raise ValueError(f"`{name}`: found beside [motion]; {_BESIDE_MOTION[name]}")
-        if self.controller is not None and self.motion is None:
-            raise ValueError(
-                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
-                'one with `integrator` = "discrete", or leave it out and estimate one step '
-                'ahead with `noise.model` = "arma"'
-            )
-        self._check_gaps()
-        wrong = self.declared_physics.foreign_keys
+        physics = self.declared_physics
+        physics.check_beside(self)
         for i, section in enumerate(self.suspects):
-            for key in sorted(section.model_fields_set & wrong.keys()):
-                raise ValueError(f"`suspects[{i}].{key}`: found {wrong[key]}")
-        if self.motion is not None and self.training.ensemble:
-            raise ValueError(
-                "`training.ensemble`: a motion has none, because medians of runs follow no "
-                "equations"
-            )
+            for key in sorted(section.model_fields_set & physics.foreign_keys.keys()):
+                raise ValueError(f"`suspects[{i}].{key}`: found {physics.foreign_keys[key]}")
         return self
-
-    def _check_gaps(self) -> None:
-        """Raise ValueError where outputs may not be missing."""
-        if self.data.missing != "keep":
-            return
-        found = '`data.missing`: found "keep"'
-        if self.motion is None:
-            raise ValueError(
-                f"{found}; lagged physics needs the outputs of every row. Leave rows out by "
-                '"skip", or state the physics as a [motion]'
-            )
-        if self.noise.model != "white":
-            raise ValueError(f'{found}; a predictor of `noise.model` needs every row: "white"')
-        if self.engine.kind not in ("auto", "memory"):
-            raise ValueError(f'{found}; rows must be in memory for it: `engine.kind` = "memory"')
 
     @model_validator(mode="after")
     def _blocks_are_several(self) -> Spec:

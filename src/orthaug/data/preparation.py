@@ -25,6 +25,7 @@ from orthaug.data.steps import (
     Run,
     Shift,
     Step,
+    Unwrap,
 )
 
 # Chebyshev filter of decimation: order, dB, share of the new Nyquist
@@ -178,13 +179,14 @@ STEPS = Registry(
         "outliers": Outliers,
         "repeats": Repeats,
         "limits": Limits,
+        "unwrap": Unwrap,
         "fill": Fill,
         "shift": Shift,
     },
     reserved=("step",),
 )
 _FILTERS = ("lowpass", "highpass", "decimate")
-MENDING = ("outliers", "repeats", "limits", "fill")
+MENDING = ("outliers", "repeats", "limits", "unwrap", "fill")
 """Steps that leave good samples as they are."""
 SAMPLING = ("decimate", "resample")
 """Steps after which there are other instants."""

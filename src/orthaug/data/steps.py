@@ -11,7 +11,7 @@ from typing import Annotated, Protocol, runtime_checkable
 import numpy as np
 from annotated_types import Ge, Gt
 
-from orthaug._base.checks import Matrix, Vector, check_number, check_type, nearest
+from orthaug._base.checks import Matrix, Vector, check_number, check_type, is_number, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.registry import OneOf, check_fields
 
@@ -313,8 +313,9 @@ class Limits:
     def __post_init__(self) -> None:
         check_fields(self)
         for name in ("low", "high"):
-            if getattr(self, name) is not None:
-                check_number(getattr(self, name), name)
+            value = getattr(self, name)
+            if value is not None and not is_number(value):
+                raise InputError(f"`{name}` must be a finite number; got {show(value)}.")
         if self.low is None and self.high is None:
             raise InputError("`limits` has neither `low` nor `high`; give one of them.")
 
@@ -359,6 +360,38 @@ class Fill:
             for a, b in zip(there[:-1], there[1:], strict=True):
                 if 1 < b - a <= self.most + 1:
                     x[a + 1 : b] = guess[a + 1 : b]
+        return run.with_values(columns, values)
+
+
+@dataclass(frozen=True)
+class Unwrap:
+    """Step that takes the jumps of an angle out, by multiples of its `period`.
+
+    Args:
+        period: in the channel's unit after its scale, such as 360 or 2π.
+        channels: names of the angles.
+
+    Examples:
+        >>> from orthaug.data import Record, prepare
+        >>> record = Record.from_arrays(u=[0.0] * 4, y=[170.0, 178.0, -174.0, -166.0])
+        >>> prepare(record, Unwrap(360.0, ("y",))).experiments[0].outputs.ravel()
+        array([170., 178., 186., 194.])
+    """
+
+    period: Annotated[float, Gt(0)]
+    channels: Channels = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if self.channels is None:
+            raise InputError("`unwrap` needs `channels`: the angles that wrap.")
+
+    def apply(self, run: Run) -> Run:
+        columns = run.columns(self.channels)
+        values = run.values[:, columns].copy()
+        for column in values.T:
+            there = np.isfinite(column)
+            column[there] = np.unwrap(column[there], period=self.period)
         return run.with_values(columns, values)
 
 

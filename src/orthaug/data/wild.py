@@ -16,6 +16,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
+from orthaug.data.angles import wrap_warnings
 from orthaug.data.gaps import complete_record, filled_record, held_warnings, saturation_warnings
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
@@ -144,7 +145,7 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
 def data_warnings(
     record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None
 ) -> list[Warning]:
-    """Return warnings of wild samples, of doubled rows, and of outputs that are constant.
+    """Return warnings of wild samples, doubled rows, angles that wrap, and constant outputs.
 
     Args:
         effect: says in a sentence what a fit without some samples gives.
@@ -159,6 +160,7 @@ def data_warnings(
     if complete is None:
         return found
     found += _repeat_warnings(complete) or held_warnings(complete)
+    found += wrap_warnings(complete)
     return [*found, *_frozen_warnings(complete), *saturation_warnings(complete)]
 
 

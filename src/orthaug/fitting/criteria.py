@@ -51,7 +51,7 @@ class Criterion(Protocol):
         """The free run that training makes; None for one step ahead."""
         ...
 
-    def on(self, record: Record, first_row: int = 0) -> Any:
+    def on(self, record: Record, first_row: int = 0, most: int = 0) -> Any:
         """Return the criterion with its open choices made for a record."""
         ...
 
@@ -108,7 +108,7 @@ class Prediction:
             else None
         )
 
-    def on(self, record: Record, first_row: int = 0) -> Prediction:
+    def on(self, record: Record, first_row: int = 0, most: int = 0) -> Prediction:
         """Return itself: it does not depend on a record."""
         return self
 
@@ -178,13 +178,17 @@ class Simulation:
         """
         return max(SHORT, 2 * self.washout) if isinstance(self.segment, str) else self.segment
 
-    def on(self, record: Record, first_row: int = 0) -> Simulation:
-        """Return the declaration with segments whose length suits a record, if none is given."""
-        return (
-            self
-            if self.segment != "auto"
-            else replace(self, segment=segment_for(record, first_row, self.washout))
-        )
+    def on(self, record: Record, first_row: int = 0, most: int = 0) -> Simulation:
+        """Return the declaration with segments whose length suits a record, if none is given.
+
+        Args:
+            most: steps at most, 0 for any number.
+        """
+        if self.segment != "auto":
+            return self
+        segment = segment_for(record, first_row, self.washout)
+        longer = most and (segment == 0 or segment > most)
+        return replace(self, segment=max(most, self.washout + 1) if longer else segment)
 
     @property
     def streamed(self) -> Simulation:
@@ -242,7 +246,7 @@ class Auto:
         """The free run that is trained where one step ahead is not enough."""
         return Simulation(self.segment, self.washout, self.start_iterations)
 
-    def on(self, record: Record, first_row: int = 0) -> Auto:
+    def on(self, record: Record, first_row: int = 0, most: int = 0) -> Auto:
         """Return itself: training begins one step ahead."""
         return self
 

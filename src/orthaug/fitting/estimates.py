@@ -20,7 +20,7 @@ from orthaug._base.views import FitView
 from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.block_scores import FreeRunScores
-from orthaug.fitting.criteria import Criterion, Prediction, Simulation
+from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.fitting.held_out import Focus, HeldOutErrors
 from orthaug.fitting.output_noise import OutputNoise, noise_of
 from orthaug.fitting.setup import TrainingSetup
@@ -28,12 +28,18 @@ from orthaug.fitting.status import Status
 from orthaug.inference.covariance import interval
 from orthaug.inference.learned_terms import equation, learned_terms, term_frame, term_lines
 from orthaug.inference.measures import Measure
-from orthaug.inference.over_experiments import FEWEST, OverExperiments, over_experiments
+from orthaug.inference.over_experiments import (
+    FEWEST,
+    OverExperiments,
+    over_experiments,
+    split_without_each,
+)
 from orthaug.models.model import Model
 from orthaug.models.response import Response
 from orthaug.models.statistics import Statistics, half_inverse
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import Coordinates
+from orthaug.physics.projection import Projection
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,8 +66,10 @@ _FOR_THE_LIBRARY = {
     *(
         "alone",
         "coordinates",
+        "free_covariance",
         "layout",
         "lines",
+        "moved_by",
         "moves_by",
         "plain_statistics",
         "reach",
@@ -237,17 +245,27 @@ class Estimate(FitView):
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
         own = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
-        changed = replace(
+        return replace(self._with_statistics(own, kind), freedom=own.freedom)._renewed()
+
+    def _with_statistics(self: Fit, statistics: Statistics, kind: str) -> Fit:
+        """Return the fit with statistics for robust errors, beside those for white noise."""
+        return replace(
             self,
-            model=replace(self.model, statistics=own),
-            plain_covariance=self.covariance
-            if self.plain_covariance is None
-            else self.plain_covariance,
-            plain_statistics=statistics if self.plain_statistics is None else self.plain_statistics,
-            freedom=own.freedom,
+            model=replace(self.model, statistics=statistics),
+            plain_covariance=self._white_covariance,
+            plain_statistics=self._white_statistics,
             std_kind=kind,
         )
-        return changed._renewed()
+
+    @property
+    def _white_covariance(self) -> Matrix | None:
+        """Cov θ̂ for white noise; None where there are no standard errors."""
+        return self.covariance if self.plain_covariance is None else self.plain_covariance
+
+    @property
+    def _white_statistics(self) -> Statistics:
+        """The model's statistics for white noise."""
+        return self.model.statistics if self.plain_statistics is None else self.plain_statistics
 
     def _renewed(self: Fit) -> Fit:
         """Return the fit with the covariance of θ̂ that follows from the model's statistics."""
@@ -371,7 +389,40 @@ class Estimate(FitView):
         return None if changes is None else self._over_experiments(changes)
 
     def _changes_without_each(self) -> Matrix | None:
-        """Return the changes of θ̂ (E, nθ) where each experiment is left out, to first order."""
+        """Return the changes of θ̂ (E, nθ) where each experiment is left out, to first order.
+
+        The training changes, and so do the points of the split where these are training rows.
+        """
+        changes = self._changes_of_training()
+        rows = None if changes is None or not self.learns else self._rows_of_split()
+        if changes is None or rows is None:
+            return changes
+        projection, directions, values, owner = rows
+        every = np.tile(owner, len(values) // len(owner))
+        found = split_without_each(projection, directions, values, every, len(changes))
+        return None if found is None else changes + found
+
+    def _changes_of_training(self) -> Matrix | None:
+        """Return `_changes_without_each` while the points of the split stay, on the free run."""
+        statistics, moves = self.model.statistics, self.moves_by()
+        free_run = self.criterion.free_run
+        assert free_run is not None, "training one step ahead has its own"
+        if self.scores is None or statistics.gram is None or moves is None:
+            return None
+        scores = self.scores.by_recording(self.problem.record, free_run.washout)
+        if scores is None:
+            return None
+        k, free = moves
+        nt = int(free[: len(self.theta)].sum())
+        half = half_inverse(statistics.among(free, len(self.theta)).information(nt), nt)
+        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * left_out(len(scores))
+
+    def _rows_of_split(self) -> tuple[Projection, Matrix | None, Matrix, Vector] | None:
+        """Return the points of the split, where these are training rows; None where they are not.
+
+        They are the physics there, the directions it is split along (None for all), the learner
+        (N, ny), and the experiment that each training row is of.
+        """
         raise NotImplementedError
 
     def _over_experiments(self, changes: Matrix) -> OverExperiments:
@@ -382,25 +433,8 @@ class Estimate(FitView):
         return replace(found, interval=self._ends(found.interval))
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return the derivative of θ by (c, w), and which entries of these move."""
+        """Return ∂θ/∂(c, w), and which entries of (c, w) move; None where that is not known."""
         raise NotImplementedError
-
-    def _changes_of_free_run(self, free_run: Simulation) -> Matrix | None:
-        """Return what leaving an experiment out of the training on the free run changes (E, nθ).
-
-        The points of the split stay.
-        """
-        statistics, moves = self.model.statistics, self.moves_by()
-        if self.scores is None or statistics.gram is None or moves is None:
-            return None
-        scores = self.scores.by_recording(self.problem.record, free_run.washout)
-        if scores is None:
-            return None
-        k, free = moves
-        nt = len(self.theta)
-        information = statistics.information(nt)[np.ix_(free, free)]
-        half = half_inverse(information, int(free[:nt].sum()))
-        return -scores[:, free] @ half @ (half.T @ k[:, free].T) * left_out(len(scores))
 
     def withheld(self: Fit, kind: str, why: Warning) -> Fit:
         """Return the fit without standard errors and intervals of θ, terms and predictions.

@@ -391,7 +391,7 @@ class MotionPlan(FitPlan[MotionProblem]):
 
     def settled(self) -> Criterion:
         criterion = self.criterion if self.asked.automatic else self.asked
-        return criterion.on(self.problem.record)
+        return criterion.on(self.problem.record, most=self.problem.steps_to_leave())
 
     def prepare(self) -> Prepared:
         request = replace(self.request, learner=self.learner)

@@ -270,8 +270,7 @@ class FreeRunTask(SimulationTask):
         places: list[StartPoint] = []
 
         def add(p: Vector, states: np.ndarray = measured, silent: bool = False) -> None:
-            loss = objective.evaluate(p, Start(states)).loss
-            places.append(StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silent))
+            places.append(StartPoint.of(objective, p, states, silent=silent))
 
         silenced = None if self.warm is not None else self.bound.silent(w)
         if self.physics is not None and silenced is not None:

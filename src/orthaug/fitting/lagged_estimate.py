@@ -27,9 +27,7 @@ from orthaug.inference.measures import (
     weigh_problem,
 )
 from orthaug.inference.nearly_shared import enlarge_covariance
-from orthaug.inference.over_experiments import (
-    split_without_each,
-)
+from orthaug.inference.over_experiments import split_without_each
 from orthaug.inference.physical import PhysicalEstimate, profile, solve
 from orthaug.inference.splitting import (
     MeasureSplit,
@@ -44,6 +42,7 @@ from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import Problem
+from orthaug.physics.projection import Projection
 from orthaug.physics.streamed import StreamedProblem
 
 NOT_UNIQUE = "theta_not_unique"
@@ -61,7 +60,12 @@ class LaggedEstimate(Estimate):
 
     @property
     def robust_kinds(self) -> tuple[str, ...]:
-        """Robust standard errors that there are for its criterion, the default first."""
+        """Robust standard errors that there are for its criterion, the default first.
+
+        None where a parameter is at a bound, or where a noise model has its own.
+        """
+        if self.at_bound or self.model.coloured:
+            return ()
         return ("newey-west", "hc3") if self.criterion.free_run is None else ROBUST_FREE_RUN
 
     @property
@@ -114,9 +118,9 @@ class LaggedEstimate(Estimate):
             with np.errstate(all="ignore"):
                 price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
             under = replace(under, price=price)
-        plain, follows = None, under.follows()
-        if self.plain_statistics is not None and follows is not None:
-            plain = self._cov_along(self.plain_statistics, follows)
+        plain = None
+        if self.plain_statistics is not None and under.slope is not None:
+            plain = self._cov_along(self.plain_statistics, under.slope)
         ensemble = under.covariance is None and self.model.numbers.tilt is not None
         text = "no standard errors after a split: an ensemble has no gradient in its weights."
         unknown = (Warning("no_standard_errors", text),) if ensemble else ()
@@ -161,8 +165,6 @@ class LaggedEstimate(Estimate):
                 "white innovations."
             )
         simulates = self.criterion.free_run is not None
-        kinds = self.robust_kinds
-        kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
                 "robust standard errors need a fit with standard errors and no parameter at a "
@@ -170,6 +172,8 @@ class LaggedEstimate(Estimate):
             )
         if simulates:
             return super().robust(lags, kind)
+        kinds = self.robust_kinds
+        kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
         if kind == "hc3":
             return self._hc3()
         residual = self.model.predict(self.problem.record).errors
@@ -177,15 +181,15 @@ class LaggedEstimate(Estimate):
         if self.measure is None and self.model.shared is None:
             covariance = robust_covariance(*used)
         else:
-            slope = self._slope()
-            covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
-        plain = self.covariance if self.plain_covariance is None else self.plain_covariance
+            k = self.moves_by()[0]
+            covariance = robust_split_covariance(self.problem, self.model, k, *used[1:])
         covariance = self._enlarge(covariance, self.model.statistics)
+        plain = self._white_covariance
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
 
     def _hc3(self) -> LaggedEstimate:
         """Return the fit with each row's own error in place of one noise variance."""
-        statistics = self.plain_statistics or self.model.statistics
+        statistics = self._white_statistics
         if (
             statistics.gram is None
             or self.model.numbers.tilt is not None
@@ -202,16 +206,8 @@ class LaggedEstimate(Estimate):
         own = hc3(
             statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share
         )
-        return replace(
-            self,
-            model=replace(self.model, statistics=own),
-            covariance=self._enlarge(self._cov_along(own, self.moves_by()[0]), own),
-            plain_covariance=self.covariance
-            if self.plain_covariance is None
-            else self.plain_covariance,
-            plain_statistics=statistics,
-            std_kind="hc3",
-        )
+        covariance = self._enlarge(self._cov_along(own, self.moves_by()[0]), own)
+        return replace(self._with_statistics(own, "hc3"), covariance=covariance)
 
     def _enlarge(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
         """Return Cov θ̂, larger along directions that the learner could nearly imitate."""
@@ -222,20 +218,20 @@ class LaggedEstimate(Estimate):
     def _renewed(self) -> LaggedEstimate:
         return replace(self, covariance=self._cov_along(self.model.statistics, self.moves_by()[0]))
 
-    def _cov_along(self, statistics: Statistics, follows: Matrix) -> Matrix | None:
+    def _cov_along(self, statistics: Statistics, k: Matrix) -> Matrix | None:
         """Return Cov θ from statistics of (c, w) and ∂θ/∂(c, w)."""
         joint = statistics.joint(len(self.theta))
-        return None if joint is None else joint.of(follows)
+        return None if joint is None else joint.of(k)
 
     def moves_by(self) -> tuple[Matrix, Vector]:
-        """Return the derivative [I ∂θ_aux/∂w] of θ by (c, w), and which entries of these move."""
-        k = np.column_stack([np.eye(len(self.theta)), self._slope()])
+        """Return [I, ∂θ_aux/∂w], by which θ follows (c, w), and which entries of these move."""
+        k = None if self.measure is None else self.measure.slope
+        if k is None:
+            k = np.column_stack([np.eye(len(self.theta)), self._learner_slope()])
         return k, np.ones(k.shape[1], dtype=bool)
 
-    def _slope(self) -> Matrix:
-        """Return ∂θ_aux/∂w under the measure that θ was split under."""
-        if self.measure is not None and self.measure.slope is not None:
-            return self.measure.slope
+    def _learner_slope(self) -> Matrix:
+        """Return ∂θ_aux/∂w under the training measure."""
         problem = self.problem
         if isinstance(problem, StreamedProblem):
             return streamed_slope(self.model, problem)
@@ -243,45 +239,45 @@ class LaggedEstimate(Estimate):
         unit = np.broadcast_to(problem.weight.matrix, (len(points.x), *problem.weight.matrix.shape))
         return learner_slope(self.model, points, problem.projection, unit, problem.noise)
 
-    def _changes_without_each(self) -> Matrix | None:
-        problem, split = self.problem, self.measure
+    def _changes_of_training(self) -> Matrix | None:
+        problem = self.problem
         if self.at_bound or isinstance(problem, StreamedProblem):
             return None
-        recordings = problem.record.recordings
-        experiments, owner = recordings[-1] + 1, np.repeat(recordings, problem.lengths)
-        whole = split is None and self.model.shared is None
-        if self.criterion.one_step and (whole or not self.learns):
+        if self.criterion.free_run is not None:
+            return super()._changes_of_training()
+        owner, experiments = self._owner, problem.record.recordings[-1] + 1
+        if self._solved:
             return split_without_each(
                 problem.projection, None, problem.unexplained, owner, experiments
             )
-        free_run = self.criterion.free_run
-        changes = (
-            self._changes_of_rows(owner, experiments)
-            if free_run is None
-            else self._changes_of_free_run(free_run)
-        )
-        measure = Training() if split is None or split.measure is None else split.measure
-        if changes is None or not isinstance(measure, OF_ROWS) or not self.learns:
-            return changes
-        weighed = weigh_problem(measure, problem)
-        values = weighed.times(self.model.learner_at(weighed.points.x))
-        every = np.tile(owner, len(values) // len(owner))
-        found = split_without_each(
-            weighed.projection, self.model.shared, values, every, experiments
-        )
-        return None if found is None else changes + found
-
-    def _changes_of_rows(self, owner: Vector, experiments: int) -> Matrix | None:
-        """Return what leaving an experiment out of the training one step ahead changes (E, nθ)."""
         if self.model.statistics.gram is None:
             return None
-        problem = self.problem
         errors = self.model.predict(problem.record).errors
         matrix = problem.weight.matrix
-        influence = row_influence(problem, self.model, self._slope())
+        influence = row_influence(problem, self.model, self.moves_by()[0])
         rows = np.einsum("kto,ko->kt", influence, errors @ (matrix.T @ matrix))
         found = np.stack([rows[owner == e].sum(axis=0) for e in range(experiments)])
         return -found * left_out(experiments)
+
+    def _rows_of_split(self) -> tuple[Projection, Matrix | None, Matrix, Vector] | None:
+        split = self.measure
+        measure = Training() if split is None or split.measure is None else split.measure
+        if self._solved or not isinstance(measure, OF_ROWS):
+            return None
+        weighed = weigh_problem(measure, self.problem)
+        values = weighed.times(self.model.learner_at(weighed.points.x))
+        return weighed.projection, self.model.shared, values, self._owner
+
+    @property
+    def _solved(self) -> bool:
+        """True if θ̂ is Φ⁺Y, whatever the learner."""
+        whole = self.measure is None and self.model.shared is None
+        return self.criterion.one_step and (whole or not self.learns)
+
+    @property
+    def _owner(self) -> Vector:
+        """The number of the experiment of each row (N,)."""
+        return np.repeat(self.problem.record.recordings, self.problem.lengths)
 
     def physical(self, physics: PhysicsMap) -> PhysicalEstimate:
         """Return the physical parameters of θ̂, with intervals by the delta method."""

@@ -16,16 +16,12 @@ from orthaug.fitting.estimates import WITHHELD, Estimate
 from orthaug.fitting.field_points import field_under, wobble
 from orthaug.inference.measures import OF_ROWS, Measure, Training
 from orthaug.inference.nearly_shared import enlarge_covariance
-from orthaug.inference.over_experiments import (
-    split_without_each,
-)
 from orthaug.inference.splitting import (
     MotionSplit,
     learned_places,
     slopes_at,
     split_motion,
 )
-from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
 from orthaug.models.moving import MotionDynamics
@@ -45,6 +41,13 @@ _VAGUE = 1.0  # standard error of a logarithm above which only the order of magn
 # times wider an interval without the prior of the weights: the prior is 3/4 of the information
 _LEANING = 2.0
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
+_OF_SPLIT = (
+    "ill_conditioned",
+    "not_unique",
+    "at_a_bound",
+    "not_identified",
+    "measure_beyond_data",
+)  # codes of warnings that another split makes anew
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -102,7 +105,7 @@ class MotionEstimate(Estimate):
     ) -> MotionEstimate:
         """Return the same motion with p̂ under a measure, and its `statistics` or p̂ alone."""
         form, segmented = self.model.form, self.segmented
-        whole = fitted_numbers(self.model.numbers)
+        whole = self.model.numbers.unsplit
         field, support, of_measure = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None and statistics:
@@ -119,40 +122,114 @@ class MotionEstimate(Estimate):
         options = {"everything": shared == "all", "wobble": moving, "statistics": statistics}
         split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
         split = replace(split, support=support, of_rows=isinstance(measure, OF_ROWS))
-        return _with_split(self, split, of_measure)
+        return self._with_split(split, of_measure)
 
     def _renewed(self) -> MotionEstimate:
         kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        return _with_split(self, self.split_by, kept)
+        return self._with_split(self.split_by, kept)
+
+    def _with_split(
+        self, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
+    ) -> MotionEstimate:
+        """Return the estimate with p̂, intervals and warnings of a split."""
+        coordinates, numbers = self.coordinates, self.model.numbers
+        held = ~coordinates.inside(split.q) & ~np.isnan(split.q)
+        values = zip(self.problem.motion.names, coordinates.physical(split.q), held, strict=True)
+        at_bound = {name: float(value) for name, value, there in values if there}
+        covariance, unseen = self._covariance_of(self.model.statistics, split, at_bound)
+        plain = self.plain_covariance
+        if plain is not None and self.plain_statistics is not None:
+            plain = self._covariance_of(self.plain_statistics, split, at_bound)[0]
+        warnings = [
+            *of_measure,
+            *self._ill_conditioned(split.q),
+            *_doubts(split, at_bound, unseen, self.learns),
+        ]
+        model = replace(
+            self.model,
+            numbers=numbers._replace(theta=split.q, theta_aux=split.q - np.asarray(numbers.c)),
+            measure=split.name,
+        )
+        return replace(
+            self,
+            model=model,
+            covariance=None if self.std_kind in WITHHELD else covariance,
+            plain_covariance=plain,
+            defect=split.defect,
+            split_by=split,
+            at_bound=at_bound,
+            unidentified=unseen,
+            warnings=(*(w for w in self.warnings if w.code not in _OF_SPLIT), *warnings),
+        )
+
+    def _ill_conditioned(self, q: Vector) -> list[Warning]:
+        statistics, count = self.model.statistics, len(q)
+        if statistics.gram is None or statistics.noise is None:
+            return []
+        gram = statistics.gram[:count, :count]
+        return ill_conditioned.of_motion(self.problem, gram, q, statistics.noise)
+
+    def _covariance_of(
+        self, statistics: Statistics, split: MotionSplit, at_bound: Collection[str]
+    ) -> tuple[Matrix | None, tuple[str, ...]]:
+        """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
+
+        No output determines these, or only the prior of the weights does.
+        """
+        names, made = self.problem.motion.names, self.free_covariance(statistics)
+        if split.slope is None or made is None:
+            return None, ()
+        joint, moves = made
+        slope = split.slope[:, moves]
+        covariance = joint.of(slope)
+        std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
+        vague = self.coordinates.positive & (std > _VAGUE / wider)
+        unseen = tuple(
+            name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
+        )
+        for i, name in enumerate(names):
+            if name in unseen or name in at_bound:
+                covariance[i] = covariance[:, i] = np.nan
+        return enlarge_covariance(covariance, statistics, split.shared), unseen
+
+    def free_covariance(
+        self, statistics: Statistics | None = None
+    ) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
+        """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
+
+        None without statistics, by default the model's.
+        """
+        statistics = self.model.statistics if statistics is None else statistics
+        if statistics.gram is None:
+            return None
+        inside = self.coordinates.inside(np.asarray(self.model.numbers.c))
+        moves = np.concatenate([inside, np.ones(len(statistics.gram) - len(inside), dtype=bool)])
+        joint = statistics.among(moves, len(inside)).joint(int(inside.sum()))
+        return None if joint is None else (joint, moves)
 
     def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return the derivative of the coordinates by (c, w), and which of these move.
+        """Return ∂q̂/∂(c, w), and which entries of (c, w) move; None without statistics."""
+        made, k = self.free_covariance(), self.split_by.slope
+        return None if made is None or k is None else (k, made[1])
 
-        None without statistics.
-        """
-        made, follows = free_covariance(self), self.split_by.follows()
-        return None if made is None or follows is None else (follows, made[1])
+    def moved_by(self, step: Vector) -> Vector:
+        """Return by how much p̂ (np,) moves with a step of (c, w): the learner's split counts."""
+        slope = self.split_by.slope
+        assert slope is not None, "p̂ is not unique"
+        return self.coordinates.slopes(self.theta) * (slope @ step)
 
-    def _changes_without_each(self) -> Matrix | None:
-        free_run = self.criterion.free_run
-        assert free_run is not None, "a motion is trained on its free run"
-        changes = self._changes_of_free_run(free_run)
-        if changes is None or not self.learns:
-            return changes
+    def _rows_of_split(self) -> tuple[Projection, Matrix | None, Matrix, Vector] | None:
         owner, field = self.segmented.recording_of_points(), self.split_by.field
         if not self.split_by.of_rows or len(field.x) % len(owner):
-            return changes
-        basis, motion = self.shared.basis, self.problem.motion
+            return None
+        motion = self.problem.motion
         slopes = np.asarray(
             slopes_at(self.segmented.dynamics.physics_only, self.theta, field.x, field.u)
         )[:, learned_places(motion)]
         unit = np.sqrt(field.weight)[:, None] / field.size
         values = parts_at(self.model.form, self.model.numbers, field.x, field.u)[1]
-        every = np.tile(owner, len(field.x) // len(owner))
-        found = split_without_each(
-            Projection.factor(slopes * unit[..., None]), basis, values * unit, every, len(changes)
-        )
-        return None if found is None else changes + found
+        projection = Projection.factor(slopes * unit[..., None])
+        return projection, self.shared.basis, values * unit, owner
 
     def _heading(self) -> list[str]:
         motion, bound, form = self.problem.motion, self.model.form.bound, self.model.form
@@ -177,108 +254,6 @@ class MotionEstimate(Estimate):
             *split,
         ]
         return lines
-
-
-def fitted_numbers(numbers: Numbers) -> Numbers:
-    """Return the numbers before any split: θ is the one fitted beside the learner."""
-    c = np.asarray(numbers.c)
-    return numbers._replace(theta=c, theta_aux=np.zeros_like(c))
-
-
-def _with_split(
-    fit: MotionEstimate, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
-) -> MotionEstimate:
-    """Return the estimate with p̂, intervals and warnings of a split."""
-    motion, numbers = fit.problem.motion, fit.model.numbers
-    c = np.asarray(numbers.c)
-    bounds = motion.coordinates.bounds
-    values = motion.coordinates.physical(split.q)
-    at_bound = {
-        n: float(value)
-        for n, value, q, low, high in zip(motion.names, values, split.q, *bounds, strict=True)
-        if q <= low or q >= high
-    }
-    covariance, unseen = _covariance(fit, fit.model.statistics, split, at_bound)
-    plain = fit.plain_covariance
-    if plain is not None and fit.plain_statistics is not None:
-        plain = _covariance(fit, fit.plain_statistics, split, at_bound)[0]
-    warnings = [
-        *of_measure,
-        *_ill_conditioned(fit, split),
-        *_doubts(split, at_bound, unseen, fit.learns),
-    ]
-    model = replace(
-        fit.model,
-        numbers=numbers._replace(theta=split.q, theta_aux=split.q - c),
-        measure=split.name,
-    )
-    own = {"ill_conditioned", "not_unique", "at_a_bound", "not_identified", "measure_beyond_data"}
-    return replace(
-        fit,
-        model=model,
-        covariance=None if fit.std_kind in WITHHELD else covariance,
-        plain_covariance=plain,
-        defect=split.defect,
-        split_by=split,
-        at_bound=at_bound,
-        unidentified=unseen,
-        warnings=(*(w for w in fit.warnings if w.code not in own), *warnings),
-    )
-
-
-def _ill_conditioned(fit: MotionEstimate, split: MotionSplit) -> list[Warning]:
-    gram, noise, count = fit.model.statistics.gram, fit.model.statistics.noise, len(split.q)
-    return (
-        []
-        if gram is None or noise is None
-        else ill_conditioned.of_motion(fit.problem, gram[:count, :count], split.q, noise)
-    )
-
-
-def _covariance(
-    fit: MotionEstimate, statistics: Statistics, split: MotionSplit, at_bound: Collection[str]
-) -> tuple[Matrix | None, tuple[str, ...]]:
-    """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
-
-    No output determines these, or only the prior of the weights does.
-    """
-    names, made = fit.problem.motion.names, free_covariance(fit, statistics)
-    if split.slope is None or made is None:
-        return None, ()
-    joint, moves = made
-    slope = split.slope[:, moves]
-    covariance = joint.of(slope)
-    std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
-    vague = fit.problem.motion.coordinates.positive & (std > _VAGUE / wider)
-    unseen = tuple(
-        name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
-    )
-    for i, name in enumerate(names):
-        if name in unseen or name in at_bound:
-            covariance[i] = covariance[:, i] = np.nan
-    return enlarge_covariance(covariance, statistics, split.shared), unseen
-
-
-def free_covariance(
-    fit: MotionEstimate, statistics: Statistics | None = None
-) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
-    """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
-
-    None without statistics, by default the model's.
-    """
-    numbers = fit.model.numbers
-    statistics = fit.model.statistics if statistics is None else statistics
-    if statistics.gram is None or statistics.middle is None:
-        return None
-    c = np.asarray(numbers.c)
-    low, high = fit.problem.motion.coordinates.bounds
-    moves = np.concatenate(
-        [(low < c) & (c < high), np.ones(len(statistics.gram) - len(c), dtype=bool)]
-    )
-    kept = np.ix_(moves, moves)  # an entry at a bound is a constant
-    own = replace(statistics, gram=statistics.gram[kept], middle=statistics.middle[kept])
-    joint = own.joint(int(moves[: len(c)].sum()))
-    return None if joint is None else (joint, moves)
 
 
 def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:

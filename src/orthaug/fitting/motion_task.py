@@ -445,6 +445,5 @@ class MotionTask(SimulationTask):
             else self.physics.end.point.theta
         )
         p = np.concatenate([q, w if silenced is None else silenced])
-        states = objective.initial.measured
-        loss = objective.evaluate(p, Start(states)).loss
-        return [StartPoint(p, states, loss if np.isfinite(loss) else np.inf, silenced is not None)]
+        silent = silenced is not None
+        return [StartPoint.of(objective, p, objective.initial.measured, silent=silent)]

@@ -256,7 +256,7 @@ class SegmentedMotion(SegmentedProblem):
         return min(self.free_run.washout, self.segments.steps - 1)
 
     @property
-    def _begins(self) -> list[list[int]]:
+    def begins(self) -> list[list[int]]:
         """The first rows of the segments of every experiment."""
         steps, washout = self.segments.steps, self._washout
         return [begins_of(len(one), steps, washout) for one in self.record.experiments]
@@ -265,14 +265,14 @@ class SegmentedMotion(SegmentedProblem):
         """Return the number of the recording of each point of `trajectory`."""
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         counts = scored.reshape(-1, self.segments.steps).sum(axis=1)
-        segments = np.repeat(self.record.recordings, [len(begins) for begins in self._begins])
+        segments = np.repeat(self.record.recordings, [len(begins) for begins in self.begins])
         return np.repeat(segments, counts[: len(segments)])
 
     def states_by_row(self, c: Vector, w: Any, states: np.ndarray) -> list[Matrix]:
         """Return the states (N, nx) of every experiment, joined from the segments' runs."""
         runs = np.moveaxis(self.runs(c, w, states), -1, 1)
         rows, place, found = runs.reshape(-1, *runs.shape[2:]), 0, []
-        for experiment, begins in zip(self.record.experiments, self._begins, strict=True):
+        for experiment, begins in zip(self.record.experiments, self.begins, strict=True):
             own = np.zeros((len(experiment), self.dynamics.states))
             for begin in begins:
                 first = begin + (self._washout if begin else 0)
@@ -284,7 +284,7 @@ class SegmentedMotion(SegmentedProblem):
 
     def with_starts(self, rows: list[Matrix]) -> SegmentedMotion:
         """Return the problem with segments that start at given states (N, nx) of all rows."""
-        flat = np.concatenate([own[b] for own, b in zip(rows, self._begins, strict=True)])
+        flat = np.concatenate([own[b] for own, b in zip(rows, self.begins, strict=True)])
         k, n0, m = np.asarray(self.segments.start).shape
         padded = np.concatenate([flat, np.zeros((k * m - len(flat), n0))])
         padded = np.where(np.isfinite(padded), padded, 0.0)

@@ -40,6 +40,14 @@ class StartPoint(NamedTuple):
     loss: float
     silent: bool
 
+    @classmethod
+    def of(
+        cls, objective: FreeRunObjective, p: Vector, states: np.ndarray, *, silent: bool = False
+    ) -> StartPoint:
+        """Return the start at p and these states, with its loss; infinite where it runs away."""
+        loss = objective.evaluate(p, Start(states)).loss
+        return cls(p, states, loss if np.isfinite(loss) else np.inf, silent)
+
 
 def _lowers_loss(free_fit: FreeRunFit, first_loss: float) -> bool:
     """Return whether the weights lowered the loss.

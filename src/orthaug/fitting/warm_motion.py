@@ -10,7 +10,6 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.fitting.criteria import Criterion
-from orthaug.fitting.initial_states import Start
 from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import SegmentedMotion
@@ -104,6 +103,4 @@ class WarmMotionTask(MotionTask):
         """Return the start at physics alone with a silent learner, and that at the model."""
         places = super().places(objective, solver, w, structure, regularization)
         states = self.plan.settle(self.begun, w, iterations=_SETTLING)
-        p = np.concatenate([self.begun, w])
-        loss = objective.evaluate(p, Start(states)).loss
-        return [*places, StartPoint(p, states, loss if np.isfinite(loss) else np.inf, False)]
+        return [*places, StartPoint.of(objective, np.concatenate([self.begun, w]), states)]

@@ -318,7 +318,7 @@ def robust_covariance(
 def robust_split_covariance(
     problem: Problem,
     model: Model,
-    slope: Matrix,
+    k: Matrix,
     residual: Matrix,
     used: float,
     lags: int | None = None,
@@ -328,30 +328,30 @@ def robust_split_covariance(
     It is the sum over the influence `[I, ∂θ_aux/∂w] M⁻¹ ψ_k e_k` of every row.
 
     Args:
-        slope: ∂θ_aux/∂w (nθ, nw).
+        k: [I, ∂θ_aux/∂w] (nθ, nθ + nw).
     """
-    influence = row_influence(problem, model, slope)
+    influence = row_influence(problem, model, k)
     matrix = problem.weight.matrix
     scores = np.einsum("kro,ko->kr", influence, residual @ (matrix.T @ matrix))
     return _correction(problem, residual, used) * newey_west(by_experiment(problem, scores), lags)
 
 
-def row_influence(problem: Problem, model: Model, slope: Matrix) -> Float[np.ndarray, "N nt ny"]:
+def row_influence(problem: Problem, model: Model, k: Matrix) -> Float[np.ndarray, "N nt ny"]:
     """Return `[I, ∂θ_aux/∂w] M⁻¹ ψ_k` of every row: what its errors move a split θ by.
 
     Args:
-        slope: ∂θ_aux/∂w (nθ, nw).
+        k: [I, ∂θ_aux/∂w] (nθ, nθ + nw).
 
     Raises:
         InputError: a fit without statistics.
     """
-    statistics, nt, ny = model.statistics, len(slope), len(problem.outputs)
+    statistics, nt, ny = model.statistics, len(k), len(problem.outputs)
     if statistics.gram is None or model.numbers.tilt is not None:
         raise InputError(
             "the fit has no statistics for robust standard errors; fit the data again."
         )
     half = half_inverse(statistics.information(nt), nt)
-    root = half @ (half.T @ np.column_stack([np.eye(nt), slope]).T)
+    root = half @ (half.T @ k.T)
     rows = len(problem.rows)
     chunks = jnp.asarray(in_chunks(problem.rows.x, chunk_shape(rows), repeat=True))
     moved = np.asarray(changes(model.form, model.numbers, chunks, jnp.asarray(root)))

@@ -71,11 +71,7 @@ class Split:
     support: float = 1.0
     """Share of the measure within reach of the training data."""
     slope: Matrix | None = None
-    """Derivative of θ by what was trained; None where it is not known."""
-
-    def follows(self) -> Matrix | None:
-        """Return ∂θ/∂(c, w), (nθ, nθ + nw)."""
-        return self.slope
+    """∂θ/∂(c, w) (nθ, nθ + nw); None where it is not known, or where θ is not unique."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,15 +89,8 @@ class MeasureSplit(Split):
     warnings: tuple[Warning, ...]
     price: Vector | None = None
     """Standard error of each θ over that under the training measure (nθ,)."""
-    slope: Matrix | None = None
-    """∂θ_aux/∂w (nθ, nw)."""
     measure: Measure | None = None
     """What it was split under."""
-
-    def follows(self) -> Matrix | None:
-        if self.slope is None:
-            return None
-        return np.column_stack([np.eye(len(self.theta)), self.slope])
 
     def __str__(self) -> str:
         text = (
@@ -149,8 +138,9 @@ def split_by_measure(
     theta = model.theta - model.theta_aux + aux
     covariance = slope = None
     if joint is not None and numbers.tilt is None:
-        slope = learner_slope(model, points, projection, unit, weighed.noise)
-        covariance = joint.of(np.column_stack([np.eye(len(theta)), slope]))
+        own = learner_slope(model, points, projection, unit, weighed.noise)
+        slope = np.column_stack([np.eye(len(theta)), own])
+        covariance = joint.of(slope)
     size = np.linalg.norm(values)
     rest = values - projection.phi @ aux
     left = projection.along(model.shared) @ projection.coordinates(rest)
@@ -255,10 +245,7 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MotionSplit(Split):
-    """q̂ (np,) of p̂ and how it follows (c, w): `slope` (np, np + nw).
-
-    None where p̂ is not unique.
-    """
+    """q̂ (np,) of p̂, its shared directions, and the points that it was split over."""
 
     q: Vector
     shared: SharedDirections

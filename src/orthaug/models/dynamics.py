@@ -57,6 +57,12 @@ class Numbers(NamedTuple):
         return self.theta - self.theta_aux
 
     @property
+    def unsplit(self) -> Numbers:
+        """These numbers before any split: θ is the one fitted beside the learner."""
+        c = np.asarray(self.c)
+        return self._replace(theta=c, theta_aux=np.zeros_like(c))
+
+    @property
     def free(self) -> Numbers:
         """These numbers without limits: the learner is not restricted beyond its training range."""
         return self if self.limits is None else self._replace(limits=None, pull=None)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 
@@ -111,6 +111,20 @@ class Statistics:
         """Return M, the Gram matrix with the precisions of the weights' prior."""
         assert self.gram is not None
         return self.gram + np.diag(prior_of(self.gram, self.ridge, nt))
+
+    def among(self, moves: Bool[np.ndarray, "n"], nt: int) -> Statistics:
+        """Return the statistics of those entries of (c, w) that move, where others are constants.
+
+        Args:
+            nt: number of θ, the leading entries.
+        """
+        kept = np.ix_(moves, moves)
+        return replace(
+            self,
+            gram=None if self.gram is None else self.gram[kept],
+            middle=None if self.middle is None else self.middle[kept],
+            ridge=np.broadcast_to(self.ridge, len(moves) - nt)[moves[nt:]],
+        )
 
     def joint(self, nt: int) -> JointCovariance | None:
         """Return Cov(c, w), the nt entries of θ first."""

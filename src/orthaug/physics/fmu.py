@@ -5,7 +5,6 @@ An FMU holds native code: to evaluate it is to run it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -89,21 +88,14 @@ class FMU(FileSource):
                 f"{self.file}: its equations depend on the time; give what does as an input."
             )
 
-    def write_back(self, values: Mapping[str, float], units: Mapping[str, str]) -> dict[str, str]:
-        """Return the parameters by the FMU's names, as JSON and as an SSP parameter set (.ssv)."""
-        there = self.describe()
-        named = {
-            self.find(name, there.parameters, "parameter").name: (value, units[name])
-            for name, value in values.items()
-        }
-        listed = {name: {"value": value, "unit": unit} for name, (value, unit) in named.items()}
+    def written(self, values: Mapping[str, float]) -> dict[str, str]:
+        """Return an SSP parameter set (.ssv)."""
         rows = "\n".join(
             f"    <ssv:Parameter name={quoteattr(name)}><ssv:Real value={quoteattr(repr(value))}/>"
             "</ssv:Parameter>"
-            for name, (value, _) in named.items()
+            for name, value in values.items()
         )
         return {
-            "parameters.json": json.dumps(listed, indent=1, ensure_ascii=False) + "\n",
             "parameters.ssv": (
                 '<?xml version="1.0" encoding="UTF-8"?>\n'
                 "<ssv:ParameterSet "

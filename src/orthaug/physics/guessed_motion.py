@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, without_gaps
@@ -28,6 +28,8 @@ _TURNED = 100.0
 _GONE = -5.0
 _FASTEST = 4096  # |eigenvalue| times the substep: the exponential of a motion has no digits beyond
 _GROWS = 10.0  # by a factor of e^10 over the record, a mode grows
+# Growth of an error over the record, and over a segment, as logarithms, and steps of a segment
+_LEAVES, _FOLLOWED, _SHORTEST = (12.0, 3.0, 8)
 _STEP = 1e-6  # relative, of differences
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
@@ -99,6 +101,10 @@ class GuessedMotion:
     @cached_property
     def modes(self) -> Complex[np.ndarray, "m nx"]:
         """Eigenvalues of ∂f/∂x [1/s] at the initial parameters and the finite guessed states."""
+        return self._modes_at(self.motion.initial)
+
+    def _modes_at(self, values: Vector) -> Complex[np.ndarray, "m nx"]:
+        """Return `modes` at some values of the parameters."""
         x, u = self.guessed_points
         size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
         columns = []
@@ -107,8 +113,7 @@ class GuessedMotion:
                 moved = np.zeros_like(x)
                 moved[i] = h
                 ends = (
-                    np.asarray(self.motion.rates(x + s * moved, u, self.motion.initial, np))
-                    for s in (1, -1)
+                    np.asarray(self.motion.rates(x + s * moved, u, values, np)) for s in (1, -1)
                 )
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
@@ -120,14 +125,35 @@ class GuessedMotion:
         """Largest |eigenvalue| of ∂f/∂x [1/s] at the initial parameters and guessed states."""
         return float(np.abs(self.modes).max(initial=0.0))
 
-    @property
-    def grows(self) -> str:
-        """A clause on the fastest growing mode at the start, with a remedy; empty without one."""
-        modes: Any = self.modes
+    def _growth(self, modes: Any) -> Vector:
+        """Return the growth [1/s] of the fastest growing mode, at every guessed state."""
         if self.motion.scheme.discrete and modes.size:
             with np.errstate(all="ignore"):
                 modes = np.log(modes) / self.record.sampling_time
-        fastest = float(modes.real.max(initial=0.0))
+        return modes.real.max(axis=1, initial=-np.inf)
+
+    def steps_to_leave(self, values: Vector | None = None) -> int:
+        """Return the steps in which errors of a free run grow twenty-fold; 0 of a stable plant.
+
+        A plant is unstable where a mode grows at most of the guessed states, so that no run over
+        the whole record follows the data. A loop that is simulated with its controller is not, nor
+        a predictor.
+
+        Args:
+            values: of the parameters; None for the initial ones.
+        """
+        modes = self.modes if values is None else self._modes_at(values)
+        growth, step = self._growth(modes), self.record.sampling_time
+        usual = float(np.median(growth)) if growth.size else 0.0
+        longest = step * max(len(one) for one in self.record.experiments)
+        if self.motion.held or self.motion.predicts or not usual * longest > _LEAVES:
+            return 0
+        return max(int(_FOLLOWED / (usual * step)), _SHORTEST)
+
+    @property
+    def grows(self) -> str:
+        """A clause on the fastest growing mode at the start, with a remedy; empty without one."""
+        fastest = float(self._growth(self.modes).max(initial=0.0))
         if self.motion.held or not fastest > _GROWS / len(self.record) / self.record.sampling_time:
             return ""
         return (

@@ -31,6 +31,10 @@ class InnovationsForm(Motion):
     """A motion whose last parameters are K, row by row; `innovations_form` makes it."""
 
     @property
+    def predicts(self) -> bool:
+        return True
+
+    @property
     def gains(self) -> int:
         """Number of entries of K."""
         return len(self.states) * len(self.outputs)

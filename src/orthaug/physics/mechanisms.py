@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -87,17 +86,9 @@ class MuJoCo(FileSource):
         seen = tuple(states.index(name) for name in outputs)
         return Rates(self.mechanism, own, actuators), Seen(seen)
 
-    def write_back(self, values: Mapping[str, float], units: Mapping[str, str]) -> dict[str, str]:
-        """Return the file with the estimates, `model.xml`, and the parameters as JSON."""
-        there = self.describe()
-        named = {
-            self.find(name, there.parameters, "parameter").name: (value, units[name])
-            for name, value in values.items()
-        }
-        listed = {name: {"value": value, "unit": unit} for name, (value, unit) in named.items()}
-        text = self.mechanism.written({name: value for name, (value, _) in named.items()})
-        listing = json.dumps(listed, indent=1, ensure_ascii=False)
-        return {"model.xml": text, "parameters.json": f"{listing}\n"}
+    def written(self, values: Mapping[str, float]) -> dict[str, str]:
+        """Return the file with these values, `model.xml`."""
+        return {"model.xml": self.mechanism.written(dict(values))}
 
 
 @dataclass(frozen=True)

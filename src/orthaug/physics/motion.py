@@ -417,6 +417,11 @@ class Motion(NotebookView):
         return replace(self, states=tuple(s for s in self.states if not s.memory))
 
     @property
+    def predicts(self) -> bool:
+        """True if its states follow the measured outputs: a predictor."""
+        return False
+
+    @property
     def held(self) -> tuple[str, ...]:
         """Names of the inputs that a controller sets: the first ones, held over a sample."""
         return ()

@@ -113,6 +113,11 @@ class Coordinates:
         """Lower and upper bounds of q, each (np,)."""
         return self.of([p.min for p in self.parameters]), self.of([p.max for p in self.parameters])
 
+    def inside(self, q: Vector) -> Bool[np.ndarray, "np"]:
+        """Return a mask of the entries of q that are not at a bound: one there is a constant."""
+        low, high = self.bounds
+        return (low < q) & (q < high)
+
 
 @dataclass(frozen=True)
 class PhysicsMap:

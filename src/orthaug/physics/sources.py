@@ -9,6 +9,7 @@ from a learner, saved and reported as any other.
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -182,7 +183,23 @@ class FileSource(PhysicsSource):
         raise NotImplementedError
 
     def write_back(self, values: Mapping[str, float], units: Mapping[str, str]) -> dict[str, str]:
-        """Return what is written of estimated parameters, as the content of files by name."""
+        """Return what is written of estimated parameters, as the content of files by name.
+
+        That is JSON with the names that the file has for them, and `written`.
+        """
+        there = self.describe().parameters
+        named = {
+            self.find(name, there, "parameter").name: (value, units[name])
+            for name, value in values.items()
+        }
+        listed = {name: {"value": value, "unit": unit} for name, (value, unit) in named.items()}
+        listing = json.dumps(listed, indent=1, ensure_ascii=False)
+        return {"parameters.json": f"{listing}\n"} | self.written(
+            {name: value for name, (value, _) in named.items()}
+        )
+
+    def written(self, values: Mapping[str, float]) -> dict[str, str]:
+        """Return files with these values in the format of the source, as content by name."""
         raise NotImplementedError
 
     def in_folder(self, folder: Path) -> FileSource:

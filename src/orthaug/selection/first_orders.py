@@ -17,12 +17,11 @@ from orthaug.selection.linear_runs import (
     FITTED,
     MOST_LAGS,
     RANK,
+    OutputRows,
     Poles,
     best_free_run,
-    first_row_of,
-    free_run_of,
+    driven_rows_of,
     from_poles,
-    lag_rows_of,
     reduced_poles,
 )
 from orthaug.selection.orders import Orders, correlated_delay
@@ -170,14 +169,9 @@ def _errors_together(
     record: Record, orders: Orders, pairs: Sequence[Pair], length: int | None
 ) -> tuple[float, ...] | None:
     """Return the error of the free run of all outputs on the last rows, as `_errors`."""
-    first = first_row_of(orders)
-    usable = [e for e in record.experiments if len(e) > first + 1]
-    if length is not None:
-        usable = [piece for e in usable for piece in _cut(e, first, length)]
-    rows = sum(len(e) - first for e in usable)
-    cut = int(FITTED * rows)
-    columns = orders.na * len(record.outputs) + sum(orders.nb) + 1
-    if cut < 2 * columns or rows - cut < 2:
+    first, columns = orders.first_row, orders.na * len(record.outputs) + sum(orders.nb) + 1
+    usable, cut = _fitted_rows(record, orders, length, columns)
+    if not usable:
         return None
     theta = _fit_together(usable, orders, pairs, cut, constant=True)
     if theta is None:
@@ -205,7 +199,7 @@ def _fit_together(
     Refined by instruments, the outputs of the free run, while that lowers its error there. None
     where the columns have not full rank.
     """
-    first = first_row_of(orders)
+    first = orders.first_row
     y = np.concatenate([e.outputs[first:] for e in experiments])[:cut]
     phi = np.concatenate([_rows_together(e, orders) for e in experiments])[:cut]
     kept = _columns_together(y.shape[1], orders, pairs)
@@ -251,22 +245,22 @@ def _columns_together(ny: int, orders: Orders, pairs: Sequence[Pair]) -> Any:
 
 def _rows_together(e: Experiment, orders: Orders) -> Matrix:
     """Return the rows of the past of all outputs, lag by lag, of the inputs, and 1."""
-    first, ny = first_row_of(orders), e.outputs.shape[1]
+    first, ny = orders.first_row, e.outputs.shape[1]
     count = len(e) - first
     past = [
         e.outputs[first - i : first - i + count, j]
         for i in range(1, orders.na + 1)
         for j in range(ny)
     ]
-    driven = lag_rows_of(e, 0, replace(orders, na=0), first)
+    driven = driven_rows_of(e, orders)
     return np.column_stack([*past, driven]) if past else driven
 
 
 def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
     """Return the free run of all outputs from their first measured rows on."""
-    first, ny = first_row_of(orders), e.outputs.shape[1]
+    first, ny = orders.first_row, e.outputs.shape[1]
     past = orders.na * ny
-    driven = lag_rows_of(e, 0, replace(orders, na=0), first) @ theta[past:]
+    driven = driven_rows_of(e, orders) @ theta[past:]
     along = theta[:past].T.copy()
     state = e.outputs[first - orders.na : first][::-1].reshape(-1).copy()
     run = np.empty((len(driven), ny))
@@ -391,8 +385,8 @@ def _tested_delay(record: Record, number: int, most: int) -> int | None:
     None where none is significant or the lags cannot be separated.
     """
     orders = Orders(MOST_LAGS, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
-    phi = np.concatenate([lag_rows_of(e, 0, orders, most) for e in record.experiments])
-    y = np.concatenate([e.outputs[most:, 0] for e in record.experiments])
+    rows = OutputRows(record.experiments, 0, orders)
+    phi, y = np.concatenate(rows.lags), rows.target
     q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
     if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / RANK:
         return None
@@ -427,18 +421,13 @@ def _errors(
     Args:
         poles: of each output, denominators by their degree at which refinement begins, too.
     """
-    first = first_row_of(orders)
-    usable = [e for e in record.experiments if len(e) > first + 1]
-    if length is not None:
-        usable = [piece for e in usable for piece in _cut(e, first, length)]
-    rows = sum(len(e) - first for e in usable)
-    cut, found = int(FITTED * rows), []
+    columns, found = orders.size + 1, []
+    usable, cut = _fitted_rows(record, orders, length, columns)
+    if not usable:
+        return None
     for j in range(len(record.outputs)):
-        columns = orders.size + 1
-        if cut < 2 * columns or rows - cut < 2:
-            return None
-        phi = np.concatenate([lag_rows_of(e, j, orders, first) for e in usable])
-        y = np.concatenate([e.outputs[first:, j] for e in usable])
+        own = OutputRows(usable, j, orders, cut)
+        phi, y = np.concatenate(own.lags), own.target
         scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
         theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=RANK)
         if rank < columns:
@@ -447,8 +436,8 @@ def _errors(
         if record.inputs:
             starts = [theta / scale]
             if poles and orders.na in poles[j]:
-                starts += from_poles(usable, j, poles[j][orders.na], orders, first, cut)
-            simulated = best_free_run(usable, j, starts, orders, first, cut)
+                starts += from_poles(own, poles[j][orders.na])
+            simulated = best_free_run(own, starts)
         with np.errstate(all="ignore"):  # one that is not stable overflows
             wrong = float(np.sqrt(np.mean((simulated[cut:] - y[cut:]) ** 2)))
         if not np.isfinite(wrong):
@@ -465,7 +454,7 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
     bounds.
     """
     orders, found = model.orders, []
-    first = first_row_of(orders)
+    first = orders.first_row
     fitted, tested = ([e for e in r.experiments if len(e) > first] for r in (train, test))
     if not tested or not fitted:
         return None
@@ -480,32 +469,40 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
             errors = np.sqrt(np.mean((run - measured) ** 2, axis=0)) / measured.std(axis=0)
         return tuple(errors.tolist()) if np.isfinite(errors).all() else None
     for j in range(len(train.outputs)):
-        phi = np.concatenate([lag_rows_of(e, j, orders, first) for e in fitted])
-        y = np.concatenate([e.outputs[first:, j] for e in fitted])
+        own, other = OutputRows(fitted, j, orders), OutputRows(tested, j, orders)
+        phi, y = np.concatenate(own.lags), own.target
         phi = phi if model.offset else phi[:, :-1]
         scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
         theta = np.linalg.lstsq(phi / scale, y, rcond=RANK)[0] / scale
         theta = theta if model.offset else np.append(theta, 0.0)
-        runs = [_modelled(e, j, theta, orders, first, train) for e in tested]
-        measured = np.concatenate([e.outputs[first:, j] for e in tested])
+        runs = other.free_runs(theta) if train.inputs else [lags @ theta for lags in other.lags]
         with np.errstate(all="ignore"):
-            error = np.sqrt(np.mean((np.concatenate(runs) - measured) ** 2)) / measured.std()
+            missed = np.concatenate(runs) - other.target
+            error = np.sqrt(np.mean(missed**2)) / other.target.std()
         if not np.isfinite(error):
             return None
         found.append(float(error))
     return tuple(found)
 
 
-def _cut(e: Experiment, first: int, length: int) -> list[Experiment]:
-    """Return pieces of so many rows, each with the lags before it."""
-    begins = range(0, len(e) - first, length)
-    return [e.rows(begin, begin + length + first) for begin in begins]
+def _fitted_rows(
+    record: Record, orders: Orders, length: int | None, columns: int
+) -> tuple[list[Experiment], int]:
+    """Return the experiments that orders are tried on, and how many rows are fitted.
 
+    No experiments where the rows are too few for so many columns.
 
-def _modelled(
-    e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int, record: Record
-) -> np.ndarray:
-    """Return the free run, or one step ahead where there are no inputs."""
-    if record.inputs:
-        return free_run_of(e, j, theta, orders, first)
-    return lag_rows_of(e, j, orders, first) @ theta
+    Args:
+        length: rows of a piece, each with the lags before it, that the experiments are cut into.
+    """
+    first = orders.first_row
+    usable = [e for e in record.experiments if len(e) > first + 1]
+    if length is not None:
+        usable = [
+            e.rows(begin, begin + length + first)
+            for e in usable
+            for begin in range(0, len(e) - first, length)
+        ]
+    rows = sum(len(e) - first for e in usable)
+    cut = int(FITTED * rows)
+    return ([] if cut < 2 * columns or rows - cut < 2 else usable), cut

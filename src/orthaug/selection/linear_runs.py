@@ -10,7 +10,8 @@ and where light damping makes these useless, at the poles of a long model that i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -36,6 +37,76 @@ Poles: TypeAlias = dict[int, Vector]
 """Denominators by their degree."""
 
 
+@dataclass(frozen=True, eq=False)
+class OutputRows:
+    """The rows of an output in some experiments that have all lags of the `orders`."""
+
+    experiments: Sequence[Experiment]
+    output: int
+    orders: Orders
+    fitted: int | None = None
+    """Rows that models are fitted to, the first of all experiments together; None for all."""
+
+    @cached_property
+    def lags(self) -> list[Matrix]:
+        """Own past, inputs from their delays on, and 1, of each experiment."""
+        return [_lag_rows(e, self.output, self.orders) for e in self.experiments]
+
+    @cached_property
+    def measured(self) -> list[Vector]:
+        """The output of each experiment."""
+        return [e.outputs[self.orders.first_row :, self.output] for e in self.experiments]
+
+    @cached_property
+    def target(self) -> Vector:
+        """The output of all experiments."""
+        return np.concatenate(self.measured)
+
+    def denominator(self, theta: Vector) -> Vector:
+        """Return the coefficients of A, 1 in front."""
+        return np.concatenate([[1.0], -theta[: self.orders.na]])
+
+    def free_runs(self, theta: Vector) -> list[Vector]:
+        """Return the output of each experiment, simulated from its first measured rows on."""
+        from scipy.signal import lfilter, lfiltic
+
+        na, first, runs = self.orders.na, self.orders.first_row, []
+        taps = self.denominator(theta)
+        for e, lags in zip(self.experiments, self.lags, strict=True):
+            driven = lags[:, na:] @ theta[na:]
+            past = e.outputs[first - 1 :: -1, self.output][:na] if first else np.empty(0)
+            with np.errstate(all="ignore"):
+                runs.append(lfilter([1.0], taps, driven, zi=lfiltic([1.0], taps, past))[0])
+        return runs
+
+    def filtered(
+        self, theta: Vector, runs: Sequence[Vector] | None = None
+    ) -> tuple[Matrix, Vector] | None:
+        """Return regressors and output filtered by 1/A, measured or of free runs.
+
+        None where A is unstable.
+        """
+        from scipy.signal import lfilter
+
+        taps = self.denominator(theta)
+        if not self.orders.na or np.any(np.abs(np.roots(taps)) >= 1):
+            return None
+        rows = self if runs is None else self._with_outputs(runs)
+        return (
+            np.concatenate([lfilter([1.0], taps, lags, axis=0) for lags in rows.lags]),
+            np.concatenate([lfilter([1.0], taps, outputs) for outputs in rows.measured]),
+        )
+
+    def _with_outputs(self, runs: Sequence[Vector]) -> OutputRows:
+        """Return the rows with the outputs of runs in place of the measured ones."""
+        experiments = []
+        for e, run in zip(self.experiments, runs, strict=True):
+            outputs = e.outputs.copy()
+            outputs[self.orders.first_row :, self.output] = run
+            experiments.append(replace(e, outputs=outputs))
+        return replace(self, experiments=experiments)
+
+
 def reduced_poles(record: Record, j: int) -> Poles:
     """Return denominators of a long model of an output, reduced to few states, by their number.
 
@@ -51,8 +122,8 @@ def reduced_poles(record: Record, j: int) -> Poles:
         return {}
     orders = Orders(long, (long,) * nu, (1,) * nu)
     usable = [e for e in record.experiments if len(e) > long + 1]
-    phi = np.concatenate([lag_rows_of(e, j, orders, long) for e in usable])[:rows]
-    y = np.concatenate([e.outputs[long:, j] for e in usable])[:rows]
+    own = OutputRows(usable, j, orders)
+    phi, y = np.concatenate(own.lags)[:rows], own.target[:rows]
     scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     theta = np.linalg.lstsq(phi / scale, y, rcond=RANK)[0] / scale
     response = np.zeros((_RESPONSE, nu))
@@ -77,49 +148,36 @@ def reduced_poles(record: Record, j: int) -> Poles:
     return found
 
 
-def from_poles(
-    experiments: list[Experiment], j: int, taps: Vector, orders: Orders, first: int, cut: int
-) -> list[Vector]:
+def from_poles(rows: OutputRows, taps: Vector) -> list[Vector]:
     """Return θ with these poles, whose free run from rest follows the output best; none without."""
     from scipy.signal import lfilter
 
-    driven = np.concatenate(
-        [
-            lfilter([1.0], taps, lag_rows_of(e, j, orders, first)[:, orders.na :], axis=0)
-            for e in experiments
-        ]
-    )[:cut]
-    y = np.concatenate([e.outputs[first:, j] for e in experiments])[:cut]
+    na, cut = rows.orders.na, rows.fitted
+    driven = np.concatenate([lfilter([1.0], taps, lags[:, na:], axis=0) for lags in rows.lags])[
+        :cut
+    ]
     scale = np.maximum(np.linalg.norm(driven, axis=0), 1e-300)
     if not np.isfinite(driven).all():
         return []
-    b = np.linalg.lstsq(driven / scale, y, rcond=RANK)[0] / scale
+    b = np.linalg.lstsq(driven / scale, rows.target[:cut], rcond=RANK)[0] / scale
     return [np.concatenate([-taps[1:], b])]
 
 
-def best_free_run(
-    experiments: list[Experiment],
-    j: int,
-    starts: Sequence[Vector],
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector:
-    """Return the free run that is best over the first `cut` rows, of some starts or refined.
+def best_free_run(rows: OutputRows, starts: Sequence[Vector]) -> Vector:
+    """Return the free run that is best over the rows that are fitted, of some starts or refined.
 
     Of several starts the steps of Gauss and Newton follow, and the past that a run begins at is
     chosen, too.
     """
-    thorough = len(starts) > 1
-    y = np.concatenate([e.outputs[first:, j] for e in experiments])
+    thorough, cut, y = len(starts) > 1, rows.fitted, rows.target
     best, least = np.full(len(y), np.inf), np.inf
     for theta in starts:
         for refine in (_by_instruments, _by_descent) if thorough else (_by_instruments,):
             own = np.inf
             for _ in range(1 + _REFINED):
-                runs = [free_run_of(e, j, theta, orders, first) for e in experiments]
+                runs = rows.free_runs(theta)
                 if thorough:
-                    runs = _from_best_starts(runs, experiments, j, theta, orders, first, cut)
+                    runs = _from_best_starts(rows, runs, theta)
                 simulated = np.concatenate(runs)
                 with np.errstate(all="ignore"):
                     square = float(np.mean((simulated[:cut] - y[:cut]) ** 2))
@@ -128,7 +186,7 @@ def best_free_run(
                 own, reached = square, theta
                 if own < least:
                     best, least = simulated, own
-                refined = refine(experiments, runs, j, theta, orders, first, cut)
+                refined = refine(rows, runs, theta)
                 if refined is None:
                     break
                 theta = refined
@@ -138,104 +196,50 @@ def best_free_run(
     return best
 
 
-def _from_best_starts(
-    runs: list[Vector],
-    experiments: list[Experiment],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> list[Vector]:
-    """Return runs from the past by which they follow the first `cut` rows best.
+def _from_best_starts(rows: OutputRows, runs: list[Vector], theta: Vector) -> list[Vector]:
+    """Return runs from the past by which they follow the rows that are fitted best.
 
     What light damping makes of the noise in a measured start lasts for long.
     """
     from scipy.signal import lfilter
 
-    taps, begin, moved = np.concatenate([[1.0], -theta[: orders.na]]), 0, []
-    for run, e in zip(runs, experiments, strict=True):
-        rows, begin = min(len(run), max(cut - begin, 0)), begin + len(run)
-        if rows > 2 * orders.na and np.isfinite(run).all():
+    na, taps, moved = rows.orders.na, rows.denominator(theta), []
+    left = len(rows.target) if rows.fitted is None else rows.fitted
+    for run, measured in zip(runs, rows.measured, strict=True):
+        count, left = min(len(run), left), max(left - len(run), 0)
+        if count > 2 * na and np.isfinite(run).all():
             still = np.zeros(len(run))
-            free = np.stack(
-                [lfilter([1.0], taps, still, zi=zi)[0] for zi in np.eye(orders.na)], axis=1
-            )
-            left = e.outputs[first : first + rows, j] - run[:rows]
+            free = np.stack([lfilter([1.0], taps, still, zi=zi)[0] for zi in np.eye(na)], axis=1)
             if np.isfinite(free).all():
-                run = run + free @ np.linalg.lstsq(free[:rows], left, rcond=None)[0]
+                missed = measured[:count] - run[:count]
+                run = run + free @ np.linalg.lstsq(free[:count], missed, rcond=None)[0]
         moved.append(run)
     return moved
 
 
-def _by_instruments(
-    experiments: list[Experiment],
-    runs: list[Vector],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector | None:
+def _by_instruments(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vector | None:
     """Return θ with the outputs of free runs as instruments, rows filtered by 1/A.
 
     None where A is not stable or the instruments do not determine θ.
     """
-    instruments = _filtered(experiments, j, theta, orders, first, runs)
-    if instruments is None:
+    instruments, measured = rows.filtered(theta, runs), rows.filtered(theta)
+    if instruments is None or measured is None:
         return None
-    measured = _filtered(experiments, j, theta, orders, first)
-    assert measured is not None
-    return _solved(*(part[:cut] for part in (instruments[0], *measured)))
+    return _solved(*(part[: rows.fitted] for part in (instruments[0], *measured)))
 
 
-def _by_descent(
-    experiments: list[Experiment],
-    runs: list[Vector],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    cut: int,
-) -> Vector | None:
+def _by_descent(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vector | None:
     """Return θ after a step of Gauss and Newton on the errors of the free runs.
 
     Their slopes are the rows of the run, filtered by 1/A. None as of `_by_instruments`.
     """
-    slopes = _filtered(experiments, j, theta, orders, first, runs)
-    if slopes is None:
+    filtered = rows.filtered(theta, runs)
+    if filtered is None:
         return None
-    left = np.concatenate([e.outputs[first:, j] for e in experiments]) - np.concatenate(runs)
-    step = _solved(slopes[0][:cut], slopes[0][:cut], left[:cut])
+    slopes = filtered[0][: rows.fitted]
+    left = (rows.target - np.concatenate(runs))[: rows.fitted]
+    step = _solved(slopes, slopes, left)
     return None if step is None else theta + step
-
-
-def _filtered(
-    experiments: list[Experiment],
-    j: int,
-    theta: Vector,
-    orders: Orders,
-    first: int,
-    runs: list[Vector] | None = None,
-) -> tuple[Matrix, Vector] | None:
-    """Return rows and output filtered by 1/A, measured or of free runs.
-
-    None where A is unstable.
-    """
-    from scipy.signal import lfilter
-
-    taps = np.concatenate([[1.0], -theta[: orders.na]])
-    if not orders.na or np.any(np.abs(np.roots(taps)) >= 1):
-        return None
-    rows, target = [], []
-    for i, e in enumerate(experiments):
-        if runs is not None:
-            outputs = e.outputs.copy()
-            outputs[first:, j] = runs[i]
-            e = replace(e, outputs=outputs)
-        rows.append(lfilter([1.0], taps, lag_rows_of(e, j, orders, first), axis=0))
-        target.append(lfilter([1.0], taps, e.outputs[first:, j]))
-    return np.concatenate(rows), np.concatenate(target)
 
 
 def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
@@ -247,29 +251,16 @@ def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
     return np.linalg.solve(system, (instruments / scale).T @ target) / scale
 
 
-def first_row_of(orders: Orders) -> int:
-    """Return the first row that has all its lags."""
-    late = (nb + nk - 1 for nb, nk in zip(orders.nb, orders.nk, strict=True))
-    return max([orders.na, *late])
-
-
-def lag_rows_of(e: Experiment, j: int, orders: Orders, first: int) -> Matrix:
+def _lag_rows(e: Experiment, j: int, orders: Orders) -> Matrix:
     """Return the rows of own past, inputs from their delays on, and 1."""
-    count = len(e) - first
+    first, count = orders.first_row, len(e) - orders.first_row
     columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
+    return np.column_stack([*columns, driven_rows_of(e, orders)])
+
+
+def driven_rows_of(e: Experiment, orders: Orders) -> Matrix:
+    """Return the rows of inputs from their delays on, and 1."""
+    first, count, columns = orders.first_row, len(e) - orders.first_row, []
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
         columns += [e.inputs[first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
     return np.stack([*columns, np.ones(count)], axis=1)
-
-
-def free_run_of(e: Experiment, j: int, theta: np.ndarray, orders: Orders, first: int) -> np.ndarray:
-    """Return the output from its first measured rows on."""
-    from scipy.signal import lfilter, lfiltic
-
-    driven = lag_rows_of(e, j, orders, first)[:, orders.na :] @ theta[orders.na :]
-    taps = np.concatenate([[1.0], -theta[: orders.na]])
-    with np.errstate(all="ignore"):
-        start = lfiltic(
-            [1.0], taps, e.outputs[first - 1 :: -1, j][: orders.na] if first else np.empty(0)
-        )
-        return lfilter([1.0], taps, driven, zi=start)[0]

@@ -44,6 +44,12 @@ class Orders:
         """Number of lags."""
         return self.na + sum(self.nb)
 
+    @property
+    def first_row(self) -> int:
+        """The first row that has all its lags."""
+        late = (nb + nk - 1 for nb, nk in zip(self.nb, self.nk, strict=True))
+        return max([self.na, *late])
+
     def smaller(self, least: Orders) -> Iterator[Orders]:
         """Yield one lag less: the oldest output, the oldest or the newest of an input.
 

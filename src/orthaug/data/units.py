@@ -1,0 +1,125 @@
+"""Units of channels against those in the headers of their columns."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from orthaug._base.errors import Warning
+from orthaug.data.headers import split_header
+from orthaug.data.record import Channel
+from orthaug.data.tables import read_titles
+
+# What engineers write, as the library of units reads it
+_WRITTEN = {
+    "Nm": "N*m",
+    "kNm": "kN*m",
+    "Ohm": "ohm",
+    "U/min": "rpm",
+    "1/min": "rpm",
+    "min-1": "rpm",
+    "min^-1": "rpm",
+    "m3/h": "m^3/h",
+    "m3/s": "m^3/s",
+}
+_FORM = re.compile(r"[A-Za-z1µμΩ°%][\w°%*/^²³·() -]*")  # no remark, such as `a.u.`
+_NEAR = 0.01  # relative error of a scale that was rounded
+
+
+class Conversion(NamedTuple):
+    """A value in another unit is `scale * value + offset`."""
+
+    scale: float
+    offset: float
+
+
+def conversion(given: str, wanted: str) -> Conversion | None:
+    """Return how values in a unit are converted to another; None where either is unknown.
+
+    Raises:
+        ValueError: units of different kinds, such as m and s.
+    """
+    if not (_FORM.fullmatch(given) and _FORM.fullmatch(wanted)):
+        return None
+    units = _registry()
+    try:
+        one, other = (units.Unit(_WRITTEN.get(text, text)) for text in (given, wanted))
+    except Exception:  # whatever the library makes of text that is no unit
+        return None
+    if one.dimensionality != other.dimensionality:
+        raise ValueError(f"{given} and {wanted} are units of different kinds")
+    zero, unity = (float(units.Quantity(value, one).to(other).magnitude) for value in (0.0, 1.0))
+    return Conversion(unity - zero, zero)
+
+
+@lru_cache(maxsize=1)
+def _registry() -> Any:
+    """Return the library's registry of units, which takes a second."""
+    import pint  # slow to import, and only units that differ need it
+
+    return pint.UnitRegistry(cache_folder=None)
+
+
+def unit_warnings(path: Path, channels: dict[str, Channel]) -> list[Warning]:
+    """Return a warning for every column whose header has another unit than its channel.
+
+    A scale or an offset is taken for a deliberate conversion, or a sensor's calibration, unless it
+    is the inverse of the right one.
+
+    Args:
+        path: a file of data.
+        channels: by the column of the file that each reads.
+    """
+    if not any(channel.unit for channel in channels.values()):
+        return []
+    titles = read_titles(path)
+    found = []
+    for header in titles.names:
+        base, unit = split_header(header)
+        unit = unit or titles.units.get(header, "")
+        channel = channels.get(header) or channels.get(base)
+        if channel is None or not unit or not channel.unit or _plain(unit) == _plain(channel.unit):
+            continue
+        text = _fault(header, unit, channel)
+        if text:
+            found.append(Warning("unit_mismatch", f"{path.name}: {text}"))
+    return found
+
+
+def _plain(unit: str) -> str:
+    return re.sub(r"[\s*·^]", "", unit).replace("²", "2").replace("³", "3")
+
+
+def _fault(header: str, unit: str, channel: Channel) -> str:
+    """Return what is wrong with a channel's scale and offset; empty for nothing."""
+    place, untouched = f"data.channels.{channel.name}", (channel.scale, channel.offset) == (1, 0)
+    says = (
+        f"the header of column '{header}' has the unit {unit}, and `{place}` has the unit "
+        f"{channel.unit}"
+    )
+    try:
+        right = conversion(unit, channel.unit)
+    except ValueError:
+        return (
+            f"{says}, of another kind, without a `scale`. Check the column, the unit and the "
+            "conversion."
+            if untouched
+            else ""
+        )
+    if right is None or (_near(right.scale, 1.0) and right.offset == 0):
+        return ""
+    inverse = channel.offset == 0 and _near(abs(channel.scale), 1 / right.scale)
+    if not untouched and (not inverse or _near(abs(channel.scale), right.scale)):
+        return ""
+    offset = f" and `offset = {right.offset:.6g}`" if right.offset else ""
+    given = "no `scale`" if untouched else f"`scale = {channel.scale:.6g}`, the inverse of it"
+    return (
+        f"{says}, with {given}. The parameters absorb such a factor, and no residual shows it. "
+        f"Give `scale = {right.scale:.6g}`{offset}, or correct the unit."
+    )
+
+
+def _near(value: float, other: float) -> bool:
+    return abs(value - other) <= _NEAR * abs(other)

@@ -1,0 +1,70 @@
+"""Angles that wrap: named in a record, and unwrapped by a step of the preparation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+from orthaug.data.angles import find_wrap, wrap_warnings
+
+
+def turning(rows: int = 600) -> np.ndarray:
+    """An angle in degrees that turns forth and back by more than a turn, with noise."""
+    t = 0.02 * np.arange(rows)
+    return 500 * np.sin(0.8 * t) + 0.2 * np.random.default_rng(1).normal(size=rows)
+
+
+def wrapped(angle: np.ndarray, period: float, low: float) -> np.ndarray:
+    return (angle * period / 360 - low) % period + low
+
+
+@pytest.mark.parametrize("period", [360.0, 2 * np.pi, 4096.0])
+@pytest.mark.parametrize("share", [-0.5, 0.0])
+def test_an_angle_that_wraps_is_named_and_unwrapped(period, share):
+    angle = turning()
+    y = wrapped(angle, period, share * period)
+    record = oa.Record.from_arrays(np.zeros(len(y)), y, sampling_time=0.02, outputs=["angle"])
+    (found,) = wrap_warnings(record)
+    assert found.code == "wrapped_angle" and f"period = {period:.10g}`" in found.text
+    right = oa.prepare(record, oa.Unwrap(period, ("angle",)))
+    moved = right.experiments[0].outputs.ravel() - angle * period / 360
+    assert np.ptp(moved) < 1e-9 * period
+    assert not wrap_warnings(right)
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        np.where(np.arange(400) % 40 < 20, 180.0, -180.0),  # a switch
+        360 * np.sin(0.05 * np.arange(400)),
+        np.random.default_rng(2).uniform(-180, 180, 400),
+        np.r_[np.zeros(200), 360 * np.ones(200)] + 0.01 * np.random.default_rng(3).normal(size=400),
+        (0.9 * np.arange(400)) % 100.0,  # a ramp that begins anew
+        np.full(400, 3.0),
+        np.full(400, np.nan),
+    ],
+    ids=["switch", "sine", "noise", "step", "ramp", "constant", "missing"],
+)
+def test_other_signals_do_not_wrap(samples):
+    assert find_wrap(samples) is None
+
+
+def test_gaps_are_unwrapped_across():
+    y = wrapped(turning(), 360.0, -180.0)
+    y[[40, 41, 300]] = np.nan
+    record = oa.Record.from_arrays(np.zeros(len(y)), y, sampling_time=0.02, missing="keep")
+    assert wrap_warnings(record)
+    right = oa.prepare(record, oa.Unwrap(360.0, ("y",)), missing="keep")
+    values = right.experiments[0].outputs.ravel()
+    assert np.isnan(values).sum() == 3 and not np.isnan(np.unwrap(values[45:290], period=360)).any()
+    assert np.nanmax(np.abs(np.diff(values))) < 30
+
+
+def test_unwrap_needs_its_channels():
+    with pytest.raises(oa.InputError, match="needs `channels`"):
+        oa.Unwrap(360.0)
+    with pytest.raises(oa.InputError, match="positive"):
+        oa.Unwrap(-1.0, ("y",))
+    with pytest.raises(oa.InputError, match="no channel 'z'"):
+        oa.prepare(oa.Record.from_arrays([0.0] * 4, [0.0] * 4), oa.Unwrap(360.0, ("z",)))
