@@ -528,6 +528,7 @@ def test_disturbances_that_add_up_are_no_missing_physics():
         assert abs(row.value - true) < 3.5 * row.std
 
 
+@pytest.mark.slow
 def test_drag_of_a_pendulum_is_named_and_no_friction_that_pushes():
     """Beside its damper sign(om) of the wrong sign explains as much as drag: "dry friction" of +0.46."""
     step, rng = 0.02, np.random.default_rng(10)
