@@ -244,6 +244,7 @@ tau = { initial = 15.0, min = 0 }
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_lag", [False, True], ids=["delay", "lag"])
 def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by_lag: bool):
     """A delay of which a lag leaves four times the noise was called hardly distinct from it."""
@@ -274,6 +275,7 @@ def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by
     assert not any(w.code in ("slow_input", "dead_time") for w in followed.result.warnings)
 
 
+@pytest.mark.slow
 def test_what_a_change_explains_is_called_no_disturbance(tmp_path):
     """A hardening spring under a low and a high force was a disturbance, and the term in `Next` the remedy."""
     random, names = np.random.default_rng(12), []

@@ -65,6 +65,7 @@ CONCEPTS = {
     "physics.mechanisms": "a kind of source",
     "physics.model_exchange": "the interface FMI",
     "analysis.contraction": "a norm in which a free run forgets its start",
+    "analysis.exchanged_inputs": "a mistake in the spec that the data show",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.independence": "a test of residuals",
     "analysis.lipschitz": "how steep the predictor is",

@@ -203,13 +203,14 @@ def test_theta_without_physical_parameters_gives_bounds_or_no_interval():
     )  # from 0.6 to 7 for 0.4
 
 
-@pytest.mark.parametrize("missing", ["coulomb", "tanh", "cubic"])
+@pytest.mark.parametrize("missing", ["coulomb", "tanh", "cubic", "drag"])
 def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(missing):
     """One lag: friction, friction that turns round slowly as a saturation does, and hardening, each as what it is."""
     form = {
         "coulomb": lambda v: 0.05 * np.sign(v),
         "tanh": lambda v: 0.1 * np.tanh(v / 0.4),
         "cubic": lambda v: 0.1 * v**3,
+        "drag": lambda v: 0.1 * v * np.abs(v),
     }
     rng = np.random.default_rng(0)
     u, y = np.repeat(rng.uniform(-1, 1, 188), 8)[:1500], np.zeros(1500)
@@ -222,6 +223,9 @@ def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(
     assert low < 0.9 < high
     if missing == "tanh":
         assert text.startswith("tanh(y[k-1], 0.4") and found.share > 0.99  # its width is profiled
+    elif missing == "drag":  # was called power(y[k-1], 2), as a square would be
+        assert text.startswith("y[k-1]*abs(y[k-1]) explains") and found.share > 0.99
+        assert "write y[k-1]*abs(y[k-1]) into the physics" in text
     else:
         assert (
             text.startswith(f"{missing} of y[k-1] explains")

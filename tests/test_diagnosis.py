@@ -633,3 +633,23 @@ def test_noise_in_the_measured_start_is_no_drift(noise):
     assert "drift" not in named
     assert (noise > 0) == ("noisy_start" in named)
     assert not noise or found.verdict == "sensor_noise"
+
+
+@pytest.mark.parametrize("learner", [None, oa.MLP((3,), inputs=("y[k-1]",))])
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_two_inputs_that_are_exchanged_are_named(exchanged, learner):
+    """A fit with the columns of two inputs exchanged was explained by a later input and a learner."""
+    rng, n = np.random.default_rng(16), 800
+    u, w = np.repeat(rng.uniform(-1, 1, n // 5), 5), rng.uniform(0, 1, n)
+    y, e = np.zeros(n), 0.01 * rng.normal(size=n)
+    for k in range(2, n):
+        y[k] = 1.5 * y[k - 1] - 0.62 * y[k - 2] + 0.3 * u[k - 2] + 0.15 * w[k - 1] + e[k]
+        y[k] -= 0.03 * y[k - 1] * abs(y[k - 1])
+    columns = np.column_stack([w, u] if exchanged else [u, w])
+    record = oa.Record.from_arrays(columns, y, inputs=["u", "w"], outputs=["y"])
+    terms = {"a1": "y[k-1]", "a2": "y[k-2]", "b": "u[k-2]", "d": "w[k-1]"}
+    physics = oa.Baseline.from_terms([oa.Term(*term) for term in terms.items()])
+    fit = oa.estimate(record, physics, learner=learner, criterion=oa.Prediction())
+    found = {one.code: one.text for one in fit.diagnose(blocks=0).warnings}
+    assert ("exchanged_inputs" in found) == exchanged
+    assert not exchanged or found["exchanged_inputs"].startswith("u and w may be exchanged")

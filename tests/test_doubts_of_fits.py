@@ -528,6 +528,7 @@ def test_disturbances_that_add_up_are_no_missing_physics():
         assert abs(row.value - true) < 3.5 * row.std
 
 
+@pytest.mark.slow
 def test_drag_of_a_pendulum_is_named_and_no_friction_that_pushes():
     """Beside its damper sign(om) of the wrong sign explains as much as drag: "dry friction" of +0.46."""
     step, rng = 0.02, np.random.default_rng(10)
@@ -590,3 +591,25 @@ def test_a_spring_and_friction_are_named_where_they_act_against_a_state(cube, fr
     )
     found = oa.diagnose(oa.estimate(record, motion, learner=None))
     assert found is not None and words in found.text
+
+
+def test_no_interval_is_spoken_of_where_none_is_given():
+    """Quadratic drag is missing, and the errors remember too long for standard errors."""
+    rng, v, rows = np.random.default_rng(3), 10.0, []
+    for target in np.repeat(rng.uniform(8, 33, 10), 60):
+        force = 0.55 * (target - v)
+        rows.append((force, v))
+        v += 0.5 * (force - 0.0005 * v * v - 0.1)
+    force, speed = np.array(rows).T
+    record = oa.Record.from_arrays(
+        u=force, y=speed + 0.05 * rng.normal(size=600), sampling_time=0.5
+    )
+    parameters = [oa.PhysicalParameter(name, at, min=0) for name, at in (("a", 0.8), ("r", 0.05))]
+    motion = oa.Motion.from_equations(
+        [oa.State("v", "a*u - r", start="y")], [oa.Output("y", "v")], parameters, ["u"]
+    )
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    texts = {warning.code: warning.text for warning in found.warnings}
+    assert all(row.ci95 is None for row in found.parameters)
+    assert texts["coloured_residual"].endswith("Missing physics may have moved the parameters.")
+    assert not any("ntervals" in text for text in texts.values())

@@ -220,6 +220,7 @@ def test_starts_that_settle_slowly_are_no_poor_minimum():
     assert left < 0.46
 
 
+@pytest.mark.slow
 def test_a_run_from_a_poor_start_is_judged_from_the_start_of_training():
     """Without inputs no text speaks of them; prey that a capacity limits were called explained by nothing."""
 

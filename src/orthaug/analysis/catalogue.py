@@ -8,6 +8,7 @@ may lack it, is all that differs between kinds of physics.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -43,6 +44,7 @@ _WIDTHS = (0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # in median sizes of what a t
 _SOFT = _WIDTHS[1:]  # of friction that turns round smoothly
 _KINKS = (0.25, 0.5, 1.0, 1.5, 2.0)  # the same: beyond these hardly a row is on the other side
 _POWERS = (0.3, 0.4, 0.5, 0.65, 0.8, 1.2, 1.5, 2.0, 2.5, 3.0)
+_WHOLE = re.compile(r"\w+(\[[^\]]*\])?")  # needs no brackets: a name, or a lag of one
 _MOST_ARGUMENTS = 8  # expressions that the families are tried on
 
 
@@ -59,11 +61,16 @@ class Family(NamedTuple):
     scaled: bool = True
 
 
+def _odd_power(x: str, power: str) -> str:
+    """Return a power with the sign of x; the square as quadratic drag is written."""
+    return f"{x}*abs({x})" if power == "2" else f"sign({x})*abs({x})**{power}"
+
+
 FAMILIES = (
     Family("tanh", lambda x, w: f"tanh({x}/{w})", _WIDTHS),
     Family("atan", lambda x, w: f"atan({x}/{w})", _WIDTHS),
     Family("stribeck", lambda x, w: f"sign({x})*exp(-abs({x})/{w})", _WIDTHS),
-    Family("power", lambda x, p: f"sign({x})*abs({x})**{p}", _POWERS, scaled=False),
+    Family("power", _odd_power, _POWERS, scaled=False),
     Family("dead_zone", lambda x, w: f"{x} - max(min({x}, {w}), -{w})", _KINKS),
     Family("saturation", lambda x, w: f"max(min({x}, {w}), -{w})", _KINKS),
 )
@@ -220,15 +227,21 @@ class Catalogue:
 
 
 def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
-    """Yield name and expression of every member of every family for an expression `on`."""
+    """Yield name and expression of every member of every family for an expression `on`.
+
+    Those that are not `scaled` are named by their expression: a power is no square of x.
+    """
     size = np.abs(values[np.isfinite(values)])
     if not np.any(size > 0):
         return
-    median, x = float(np.median(size[size > 0])), f"({on})"
+    median, whole = float(np.median(size[size > 0])), _WHOLE.fullmatch(on) is not None
+    x = on if whole else f"({on})"
     for family in FAMILIES:
         for member in family.members:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
-            yield f"{family.name}({on}, {w})", family.text(x, w)
+            text = family.text(x, w)
+            text = text if whole else text.replace(f"({x})", x)
+            yield f"{family.name}({on}, {w})" if family.scaled else text, text
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:

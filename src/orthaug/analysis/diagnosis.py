@@ -25,6 +25,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.exchanged_inputs import exchanged_inputs
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
@@ -83,7 +84,8 @@ _SIZABLE = 0.02
 _FEWEST_COMPLETE = 30  # rows with all outputs, to test residuals
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
-_UNCOUNTED = " Intervals cover noise only: missing physics may have moved the parameters by more."
+_UNCOUNTED = "Intervals cover noise only: missing physics may have moved the parameters by more."
+_MOVED = "Missing physics may have moved the parameters."
 
 
 def diagnose(
@@ -209,13 +211,10 @@ def _of_motion(
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
     warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
-    warnings += (
-        []
-        if white
-        else [
-            Warning("coloured_residual", colour_sentence(fit) + (_UNCOUNTED if explained else ""))
-        ]
-    )
+    if not white:
+        given = fit.std is not None and bool(np.isfinite(fit.std).any())
+        more = f" {_UNCOUNTED if given else _MOVED}" if explained else ""
+        warnings.append(Warning("coloured_residual", colour_sentence(fit) + more))
     found = (verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
     return Diagnosis(*found, late=late, steps=coarse.steps if coarse else None)
 
@@ -306,7 +305,9 @@ def _of_lagged(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
     found = _conclude(seen, free_run if free_runs else None)
-    return found if restarted is None else replace(found, warnings=(restarted[1], *found.warnings))
+    more = () if restarted is None else (restarted[1],)
+    more += exchanged_inputs(problem) if found.verdict == "unmodelled" else ()
+    return replace(found, warnings=(*more, *found.warnings))
 
 
 def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:

@@ -26,9 +26,10 @@ _FEWEST_BLOCKS = 12
 _FEWEST_INDEPENDENT = 10
 _FEWEST_TESTED = 40  # rows from which White's test is asked
 _SHORT = 5  # steps of a block of errors that are white and of uneven size
-UNEVEN = 0.05  # level of White's test
+# Levels of White's test, and of the test whether a residual is white, of all outputs together: of
+# errors that are independent and alike 5 % get robust standard errors by chance
+UNEVEN, _LEVEL = (0.03, 0.01)
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
-_LEVEL = 0.01  # of the test whether a residual is white
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
@@ -172,7 +173,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
         return None
     for i in range(len(fit.problem.outputs)):
         pieces = [errors[:, i] for errors in errors_of(response)]
-        if _is_coloured(pieces):
+        if _is_coloured(pieces, len(fit.problem.outputs)):
             rows = sum(map(len, pieces))
             acf = np.asarray(autocorrelation(pieces, rows // ROWS_PER_LAG))
             quiet = np.abs(acf) < 2 / np.sqrt(rows)
@@ -202,11 +203,15 @@ def _is_tested(fit: Any) -> bool:
 
 def _coloured_run(fit: Any) -> bool:
     """Return whether the errors of the free run are coloured in some output."""
-    return any(_is_coloured([one[one != 0] for one in output]) for output in fit.scores.errors())
+    every = fit.scores.errors()
+    return any(_is_coloured([one[one != 0] for one in output], len(every)) for output in every)
 
 
-def _is_coloured(pieces: list[Vector]) -> bool:
-    """Return whether Ljung-Box rejects a white residual and a correlation is sizable."""
+def _is_coloured(pieces: list[Vector], outputs: int) -> bool:
+    """Return whether Ljung-Box rejects a white residual and a correlation is sizable.
+
+    The test is one of as many as there are outputs (Bonferroni).
+    """
     box, acf = (
         ljung_box(pieces, LAGS),
         autocorrelation(pieces, sum(map(len, pieces)) // ROWS_PER_LAG),
@@ -214,6 +219,6 @@ def _is_coloured(pieces: list[Vector]) -> bool:
     return (
         box is not None
         and acf is not None
-        and box.p < _LEVEL
+        and outputs * box.p < _LEVEL
         and np.abs(acf[1:]).max() >= PRACTICALLY_WHITE
     )

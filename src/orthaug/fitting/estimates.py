@@ -46,14 +46,15 @@ if TYPE_CHECKING:
 
 STD_KINDS = {
     "plain": "for white errors of constant variance",
-    "hc3": "robust (HC3), because the variance of the errors is not constant",
+    "hc3": "robust (HC3), because White's test finds errors of varying size (by chance in 3 %)",
     "newey-west": "robust (Newey-West), because the one-step residual is coloured",
     "batch-means": "robust (batch means), because the errors of the free run are coloured",
     "autoregressive": (
         "robust (autoregressive errors), because the errors of the free run are coloured"
     ),
     "batch-means-uneven": (
-        "robust (batch means), because the variance of the free run's errors is not constant"
+        "robust (batch means), because White's test finds errors of the free run of varying size "
+        "(by chance in 3 %)"
     ),
     "none": "none: the errors of the free run are correlated over too many steps",
     "chosen": "none: the terms were chosen on the rows that were fitted",
