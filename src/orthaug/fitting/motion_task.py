@@ -49,6 +49,7 @@ _POOR = 0.5  # of the output's deviation: what is left above it may not be the b
 _SHORT_ITERATIONS = 15  # over segments that are not the last
 # Steps at most by which starts follow the outputs: a descent damps no step of theirs
 _SETTLING = 25
+_LOWER = 0.98  # of the misfit: what other starts of the segments must leave
 _STARTS = 8  # drawn, where the declared initial values lead nowhere
 _WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
 _CHEAP = 1_000_000  # operations of a pass over the record's equations
@@ -73,6 +74,7 @@ def train_motion_physics(
         best = _descend_from_others(own, solver, best)
     if best is None:
         return segmented, None
+    best = _from_settled_states(own, solver, best)
     spent = {"iterations": best.iterations, "seconds": best.seconds}
     segmented, best = _fine_enough(segmented, best, solver)
     point = best.end.point
@@ -82,6 +84,26 @@ def train_motion_physics(
     segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
     mean_square = segmented.physics_only.mean_square(point.theta, ())
     return segmented, best._replace(mean_square=mean_square, **spent)
+
+
+def _from_settled_states(
+    own: SegmentedMotion, solver: LevenbergMarquardt, best: FreeRunFit
+) -> FreeRunFit:
+    """Return the end of a further descent where starts that follow the data anew are better.
+
+    Starts that followed the parameters all the way down may have ended in a minimum of their own.
+    """
+    theta = best.end.point.theta
+    states = own.settle(theta, iterations=_SETTLING)
+    with np.errstate(all="ignore"):
+        settled = own.objective().evaluate(theta, Start(states))
+    if not settled.misfit < _LOWER * best.end.point.misfit:
+        return best
+    other = descend_from(own, solver, [theta], None, settled=states)
+    if other is None or not other.end.point.misfit < best.end.point.misfit:
+        return best
+    spent = {"iterations": best.iterations + other.iterations}
+    return other._replace(seconds=best.seconds + other.seconds, restarted=best.restarted, **spent)
 
 
 def is_cheap(segmented: SegmentedMotion) -> bool:

@@ -1,0 +1,58 @@
+"""Segments whose starts followed the parameters into a minimum of their own begin anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+
+STEP = 0.02
+
+
+def decay(rows: int = 1100) -> np.ndarray:
+    """Return angles of θ'' = −21.8 sin θ − 0.05 θ' − 0.06 θ'|θ'| from 2.6 rad at rest, in rad."""
+    state, found = np.array([2.6, 0.0]), []
+
+    def rates(x: np.ndarray) -> np.ndarray:
+        return np.array([x[1], -21.8 * np.sin(x[0]) - x[1] * (0.05 + 0.06 * abs(x[1]))])
+
+    for _ in range(rows):
+        found.append(state[0])
+        a = rates(state)
+        b = rates(state + STEP / 2 * a)
+        c = rates(state + STEP / 2 * b)
+        state = state + STEP / 6 * (a + 2 * b + 2 * c + rates(state + STEP * c))
+    return np.array(found) + 0.01 * np.random.default_rng(4).normal(size=rows)
+
+
+def pendulum(w2: float, d1: float) -> oa.Motion:
+    """The physics without the drag that grows with the square."""
+    return oa.Motion.from_equations(
+        [
+            oa.State("th", "om", start="y"),
+            oa.State("om", "-w2*sin(th) - d1*om", start="derivative of y", learned=True),
+        ],
+        [oa.Output("y", "th")],
+        [oa.PhysicalParameter("w2", w2, min=0), oa.PhysicalParameter("d1", d1, min=0)],
+        [],
+    )
+
+
+@pytest.fixture(scope="module")
+def record() -> oa.Record:
+    return oa.Record.from_arrays(np.zeros((1100, 0)), decay(), sampling_time=STEP)
+
+
+def test_two_initial_values_lead_to_one_solution(record):
+    far = oa.estimate(record, pendulum(20.0, 0.1), learner=None)
+    near = oa.estimate(record, pendulum(22.0, 0.3), learner=None)
+    assert far.status.loss <= 1.02 * near.status.loss
+    assert np.allclose(np.asarray(far.theta), np.asarray(near.theta), rtol=0.02)
+
+
+def test_a_learner_beside_them_reaches_the_noise(record):
+    fit = oa.estimate(
+        record, pendulum(20.0, 0.1), learner=oa.MLP(hidden=(4,), inputs=("om",)), seed=0
+    )
+    assert np.sqrt(fit.status.loss) < 0.03  # of the deviation, where the noise is 0.016
