@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 import pytest
+from test_cli import run
 
 import orthaug as oa
 from orthaug.data.angles import find_wrap, wrap_warnings
@@ -68,3 +71,23 @@ def test_unwrap_needs_its_channels():
         oa.Unwrap(-1.0, ("y",))
     with pytest.raises(oa.InputError, match="no channel 'z'"):
         oa.prepare(oa.Record.from_arrays([0.0] * 4, [0.0] * 4), oa.Unwrap(360.0, ("z",)))
+
+
+def test_init_unwraps_before_it_looks_for_orders(tmp_path):
+    rng = np.random.default_rng(6)
+    u = np.repeat(rng.uniform(-1, 1.4, 40), 30)
+    speed, angle, y = 0.0, 0.0, []
+    for value in u:
+        y.append(angle % 360)
+        speed += 0.05 * (value - 0.2 * speed) / 0.5
+        angle += 0.05 * 60 * speed
+    rows = "\n".join(f"{a:.4f},{b + 0.05 * rng.normal():.2f}" for a, b in zip(u, y, strict=True))
+    (tmp_path / "run.csv").write_text(f"torque [Nm],angle [deg]\n{rows}\n")
+    made = tmp_path / "spec.toml"
+    named = ("--inputs", "torque [Nm]", "--outputs", "angle [deg]")
+    done = run("init", tmp_path / "run.csv", *named, "--out", made)
+    assert done.code == 0 and "an angle that wraps at 360" in done.out
+    steps = tomllib.loads(made.read_text(encoding="utf-8"))["data"]["prepare"]
+    assert steps[0] == {"step": "unwrap", "period": 360.0, "channels": ["angle"]}
+    fitted = oa.fit_spec(made).result
+    assert fitted.scores["train"].simulation.nrmse[0] < 0.1

@@ -25,6 +25,7 @@ ROWS = 4000  # at most
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
+_EXPLAINED = 0.7  # of the output's deviation: what is left above it is not explained by a delay
 _ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
@@ -279,7 +280,7 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
             for change in (_delay, _lag)
         )
         best = _lowest_argument(delays.leaves, most)
-        if delays.leaves(best) < (1 - _LATE) * declared:
+        if delays.leaves(best) < min((1 - _LATE) * declared, _EXPLAINED):
             slow = _lowest_argument(lags.leaves, most)
             found.append(
                 LateInput(

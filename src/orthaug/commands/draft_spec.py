@@ -10,9 +10,10 @@ from typing import Any
 
 import tomlkit
 
-from orthaug._base.lines import plural
+from orthaug._base.lines import join_words, plural
 from orthaug.commands.folder import relative
 from orthaug.commands.written_motion import motion_section
+from orthaug.data.angles import find_wrap
 from orthaug.data.columns import Column
 from orthaug.data.survey import Survey
 from orthaug.physics.motion import Motion
@@ -65,11 +66,18 @@ def time_of(found: Survey, roles: Roles) -> str | None:
 def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
     """Return the preparation that the data need.
 
-    Spikes of outputs are replaced, and uneven instants resampled onto a grid.
+    Angles that wrap go on, spikes of other outputs are replaced, and uneven instants resampled
+    onto a grid.
     """
-    steps: list[tuple[str, dict[str, Any]]] = []
-    if any(column.spikes for column in roles.outputs):
-        threshold = min(column.threshold for column in roles.outputs)
+    wraps = {column.name: find_wrap(column.values) for column in roles.outputs}
+    steps: list[tuple[str, dict[str, Any]]] = [
+        ("unwrap", {"period": wrap.period, "channels": [name]})
+        for name, wrap in wraps.items()
+        if wrap is not None
+    ]
+    spiky = [one for one in roles.outputs if one.spikes and wraps[one.name] is None]
+    if spiky:
+        threshold = min(column.threshold for column in spiky)
         steps += [
             ("outliers", {"threshold": threshold}),
             ("fill", {"most": FILLED, "method": "pchip"}),
@@ -81,6 +89,16 @@ def steps_of(found: Survey, roles: Roles) -> list[tuple[str, dict[str, Any]]]:
     if roles.thinned > 1:
         steps.append(("decimate", {"factor": roles.thinned}))
     return steps
+
+
+def wrapped_text(steps: list[tuple[str, dict[str, Any]]]) -> list[str]:
+    """Return a line on each angle that a step unwraps."""
+    return [
+        f"{join_words(keys['channels'])}: an angle that wraps at {keys['period']:.10g}; the step "
+        "`unwrap` lets it go on"
+        for kind, keys in steps
+        if kind == "unwrap"
+    ]
 
 
 def step_of(found: Survey, roles: Roles) -> float:

@@ -24,6 +24,7 @@ from orthaug.commands.draft_spec import (
     spec_text,
     steps_of,
     time_of,
+    wrapped_text,
 )
 from orthaug.data.columns import Column
 from orthaug.data.gaps import filled_record, held_rows, regular_rows
@@ -502,6 +503,7 @@ def _account(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
             "[motion] can run through the others"
         )
+    lines += wrapped_text(steps_of(found, roles))
     if roles.held:
         names = join_words(roles.held)
         lines.append(

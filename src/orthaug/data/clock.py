@@ -118,7 +118,8 @@ class Clock:
                 named = f"column '{one.column.header}'"
                 return f"{self.step:g} s, because {named} has each instant in {held} rows"
             fault = "begins anew with each experiment" if self.restarts else one.fault
-            return f"{self.step:g} s is usual in column '{one.column.header}', which {fault}"
+            sort = "; if rows were exchanged, sort the file by it" if "falls" in fault else ""
+            return f"{self.step:g} s is usual in column '{one.column.header}', which {fault}{sort}"
         header, known = self.column.header, ""
         if not self.by_name:
             known = ", which rises as time does"
@@ -231,7 +232,9 @@ def _fault(column: Column, rows: int) -> RefusedColumn | None:
     if len(steps) and steps[at - 1] < 0:
         went = f"falls from {values[at - 1]:g} to {values[at]:g}"
     fault = f"{went} in row {row}" if len(steps) and (steps > 0).mean() >= _RISES else ""
-    return RefusedColumn(column, f"{went} in row {row}, so it is not the time", False, fault)
+    sort = "; if rows were exchanged, sort the file by it" if fault and "falls" in went else ""
+    text = f"{went} in row {row}, so it is not the time{sort}"
+    return RefusedColumn(column, text, False, fault)
 
 
 def _rows_of_each(values: Vector) -> int:
