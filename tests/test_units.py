@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
-from orthaug import Channel, load_spec
+from orthaug import Channel, Record, load_spec
 from orthaug.data.units import conversion, unit_warnings
+from orthaug.data.wild import data_warnings
 
 SPEC = """
 [data]
@@ -79,3 +81,16 @@ def test_units_in_a_row_under_the_header(tmp_path):
     (tmp_path / "run.csv").write_text(f"u,w\nV,km/h\n{rows}\n")
     found = unit_warnings(tmp_path / "run.csv", {"w": Channel("w", "m/s")})
     assert len(found) == 1 and "scale = 0.277778" in found[0].text
+
+
+@pytest.mark.parametrize(("noise", "said"), [(0.0, True), (1e-3, True), (0.05, False)])
+def test_one_signal_in_two_columns(noise, said):
+    rng = np.random.default_rng(1)
+    speed = np.cumsum(rng.normal(size=400))
+    other = 30 / np.pi * (speed + noise * speed.std() * rng.normal(size=400))
+    outputs = np.stack([speed, rng.normal(size=400), np.round(other, 2)], axis=1)
+    record = Record.from_arrays(np.zeros(400), outputs, outputs=["rad_s", "x", "rpm"])
+    found = [w.text for w in data_warnings(record) if w.code == "same_signal"]
+    assert len(found) == said
+    if said:
+        assert "rpm is 9.5" in found[0] and "*rad_s" in found[0]

@@ -443,11 +443,12 @@ def advise(
     own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
     here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
     if before > _FAR_OFF * here:
+        share = f"has an error of {before:.3g} of the output's deviation"
+        does = "diverges" if math.isinf(before) else share
         text = (
-            "No change of the spec was tried: fitted to fewer rows, the model has an error of "
-            f"{_error(before)} of the output's deviation in free run over {rows.where}, instead of "
-            f"{_error(here)}. The rows before do not determine it, so a comparison there would say "
-            "little."
+            f"No change of the spec was tried: fitted to fewer rows, the model {does} in free run "
+            f"over {rows.where}, where the error of this one is {_error(here)}. The rows before do "
+            "not determine it, so a comparison there would say little."
         )
         return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
     chosen = found[: job.physics.most_trials]
@@ -465,7 +466,7 @@ def _conclude_trials(
         for one in tried
         if one.pieces is not None
         and _ratio(one.pieces, base).code == "helps"
-        and not (poor and one.error > _NO_BETTER)
+        and not (one.error > _NO_BETTER and (poor or one.error > _TAMED * before))
     ]
     better: list[ProposalErrors] = []
     for one in sorted(helps, key=lambda one: one.error):

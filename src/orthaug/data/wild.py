@@ -36,6 +36,7 @@ _REPEATS = 2  # single rows that repeat the one before, at least
 _MOVING = 0.01  # of the deviation of its steps: by less an output rests
 _BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
+_SAME = 3e-3  # of an output's deviation: what is left of it beside another one
 
 
 @dataclass(frozen=True)
@@ -160,8 +161,34 @@ def data_warnings(
     if complete is None:
         return found
     found += _repeat_warnings(complete) or held_warnings(complete)
-    found += wrap_warnings(complete)
+    found += wrap_warnings(complete) + _same_signal_warnings(complete)
     return [*found, *_frozen_warnings(complete), *saturation_warnings(complete)]
+
+
+def _same_signal_warnings(record: Record) -> list[Warning]:
+    """Return a warning of each output that is another one in another unit."""
+    found, outputs = [], np.concatenate([one.outputs for one in record.experiments])
+    centred = outputs - outputs.mean(axis=0)
+    size = np.linalg.norm(centred, axis=0)
+    for j in range(1, len(record.outputs)):
+        for i in range(j):
+            if not size[i] * size[j] > 0:
+                continue
+            alike = float(centred[:, i] @ centred[:, j]) / (size[i] * size[j])
+            if alike * alike < 1 - _SAME**2:
+                continue
+            first, second = record.outputs[i].name, record.outputs[j].name
+            slope = alike * size[j] / size[i]
+            offset = float(outputs[:, j].mean() - slope * outputs[:, i].mean())
+            line = f"{slope:.4g}*{first}" + (f" + {offset:.4g}" if abs(offset) > _SAME else "")
+            text = (
+                f"{second} is {line} to {percent(np.sqrt(max(1 - alike * alike, 0.0)), 2)}: one "
+                "signal in two columns. Two models are fitted to it, and intervals of common "
+                "parameters count it twice. Leave one of the two out."
+            )
+            found.append(Warning("same_signal", text))
+            break
+    return found
 
 
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
