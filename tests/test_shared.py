@@ -587,3 +587,22 @@ PLAIN = oa.Motion.from_equations(
     [oa.PhysicalParameter(name, 1.0) for name in ("m", "c")],
     ["force"],
 )
+
+
+def test_robust_errors_of_a_free_run_are_larger_along_what_is_nearly_shared():
+    """White sensor noise: batch means and plain errors are of one size, along `e` too."""
+    rng = np.random.default_rng(8)
+    v, y = np.convolve(rng.normal(size=1240), np.ones(40) / 6)[40:1240], [0.0]
+    extra = np.sign(v + 0.02 * v.std() * rng.normal(size=len(v)))
+    for k in range(1, len(v)):
+        y.append(0.7 * y[-1] + 1.5 * extra[k] + 0.8 * v[k])
+    y = np.array(y) + 0.05 * rng.normal(size=len(v))
+    record = oa.Record.from_arrays(
+        np.column_stack([v, extra]), y, sampling_time=1.0, inputs=["v", "extra"], outputs=["y"]
+    )
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("e", "extra[k]")])
+    learner = oa.MLP(hidden=(8,), inputs=("v[k]",))
+    fit = oa.estimate(record, physics, learner=learner, criterion=oa.Simulation(washout=10))
+    assert fit.problem.shared.nearly
+    ratio = fit.robust().std[1] / fit.std[1]
+    assert 0.85 < ratio < 1.5

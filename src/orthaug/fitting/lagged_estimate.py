@@ -216,7 +216,11 @@ class LaggedEstimate(Estimate):
         )
 
     def _renewed(self) -> LaggedEstimate:
-        return replace(self, covariance=self._cov_along(self.model.statistics, self.moves_by()[0]))
+        own = self.model.statistics
+        covariance = self._cov_along(own, self.moves_by()[0])
+        if self.measure is None:  # as of the errors without this
+            covariance = self._enlarge(covariance, own)
+        return replace(self, covariance=covariance)
 
     def _cov_along(self, statistics: Statistics, k: Matrix) -> Matrix | None:
         """Return Cov θ from statistics of (c, w) and ∂θ/∂(c, w)."""
