@@ -485,3 +485,24 @@ def test_whatever_is_given_ends_in_words(cubic):
     assert tried(view.to_control) == len(WRONG)
     with pytest.raises(InputError, match="`kind` must be one of bode, poles; got 'residual'"):
         oa.plot(view, "residual")
+
+
+def test_a_static_gain_that_is_rounding_is_zero():
+    """A capacitor in the loop: no current flows at rest."""
+    rng = np.random.default_rng(3)
+    u, x, y = np.repeat(rng.uniform(-5, 5, 60), 20), np.zeros(2), []
+    for value in u:
+        y.append(x)
+        for _ in range(10):
+            i, v = x
+            x = x + 2e-6 * np.array([(value - v - 2 * i) / 4e-3, i / 22e-6])
+    motion = oa.Motion.from_equations(
+        [oa.State("i", "(u - v - R*i)/L", start="il"), oa.State("v", "i/22e-6", start="uc")],
+        [oa.Output("uc", "v"), oa.Output("il", "i")],
+        [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 3e-3, min=0)],
+        ["u"],
+    )
+    noisy = np.array(y) * (1 + 1e-2 * rng.normal(size=(1200, 2)))
+    record = oa.Record.from_arrays(u, noisy, sampling_time=2e-5, outputs=["uc", "il"])
+    gain = oa.linearize(oa.estimate(record, motion, learner=None).model)[0].gain
+    assert gain[0, 0] == pytest.approx(1, abs=1e-9) and gain[1, 0] == 0

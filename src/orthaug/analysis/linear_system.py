@@ -26,6 +26,7 @@ from orthaug.models.stepping import Memory
 _ZERO = 1e-12  # of a balanced matrix's norm: a direction that one step forgets
 _DEFECTIVE = 1e-6  # |wᴴv| of eigenvectors below which a pole has no derivative
 _UNIT = 1e-9  # distance from 1 at which a pole integrates
+_NOTHING = 1e-14  # of the terms that a static gain adds up: rounding
 METHODS = ("zoh", "tustin")
 _ROUNDING = 1e-8  # of a matrix: what the logarithm must give back
 
@@ -113,11 +114,23 @@ class System:
         return self.response(turn if self.step is None else np.exp(turn * self.step))
 
     def gain(self) -> Response | None:
-        """Return the static gain (1, ny, nu); None for a system that integrates."""
+        """Return the static gain (1, ny, nu); None for a system that integrates.
+
+        What is rounding beside the terms that add up to it is 0.
+        """
         if self.integrates:
             return None
-        found = self.response(np.array([1.0 + 0j if self.step is not None else 0j]))
-        return Response(found.value.real, None if found.moved is None else found.moved.real)
+        z = np.array([1.0 + 0j if self.step is not None else 0j])
+        found = self.response(z)
+        matrix = z.real[0] * np.eye(self.states) - self.a
+        inside = np.abs(np.linalg.solve(matrix, self.b))
+        error = np.abs(np.linalg.inv(matrix)) @ (np.abs(matrix) @ inside)  # Skeel 1979
+        least = _NOTHING * (np.abs(self.c) @ error + np.abs(self.d))
+        value, moved = (
+            None if part is None else np.where(np.abs(part.real) < least, 0.0, part.real)
+            for part in found
+        )
+        return Response(value, moved)
 
 
 class Response(NamedTuple):
