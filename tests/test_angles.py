@@ -44,10 +44,11 @@ def test_an_angle_that_wraps_is_named_and_unwrapped(period, share):
         np.random.default_rng(2).uniform(-180, 180, 400),
         np.r_[np.zeros(200), 360 * np.ones(200)] + 0.01 * np.random.default_rng(3).normal(size=400),
         (0.9 * np.arange(400)) % 100.0,  # a ramp that begins anew
+        np.where(np.arange(400) == 77, 3 + 2 * np.pi, 3 * np.sin(0.1 * np.arange(400))),
         np.full(400, 3.0),
         np.full(400, np.nan),
     ],
-    ids=["switch", "sine", "noise", "step", "ramp", "constant", "missing"],
+    ids=["switch", "sine", "noise", "step", "ramp", "spike", "constant", "missing"],
 )
 def test_other_signals_do_not_wrap(samples):
     assert find_wrap(samples) is None

@@ -16,6 +16,7 @@ _OFF = 3.0  # times the largest other step, by which a jump misses the period
 _SMOOTH = 0.25  # of the period: the largest step of an angle that is sampled fast enough
 _COVERED = 0.97  # of the period, which the samples cover
 _RARELY = 0.2  # of the steps are jumps, at most
+_SPIKE = 2  # rows, behind which a signal that jumped back was a wrong sample
 _BETWEEN = 0.05  # of the samples, at least, in the middle half: no signal that switches
 
 
@@ -43,6 +44,9 @@ def find_wrap(samples: Vector) -> Wrap | None:
     count, usual = int(jumps.sum()), float(np.abs(steps[~jumps]).max(initial=0.0))
     if not 0 < count <= _RARELY * len(steps) or not 0 < usual < _SMOOTH * covered:
         return None
+    pairs = np.flatnonzero(jumps)[: count // 2 * 2].reshape(-1, 2)
+    if count % 2 == 0 and all(b - a <= _SPIKE and steps[a] * steps[b] < 0 for a, b in pairs):
+        return None  # wrong samples
     if np.mean(np.abs(values - (values.min() + values.max()) / 2) < covered / 4) < _BETWEEN:
         return None
     for period in _PERIODS:
