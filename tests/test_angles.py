@@ -74,6 +74,7 @@ def test_unwrap_needs_its_channels():
         oa.prepare(oa.Record.from_arrays([0.0] * 4, [0.0] * 4), oa.Unwrap(360.0, ("z",)))
 
 
+@pytest.mark.slow
 def test_init_unwraps_before_it_looks_for_orders(tmp_path):
     rng = np.random.default_rng(6)
     u = np.repeat(rng.uniform(-1, 1.4, 40), 30)

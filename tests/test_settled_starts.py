@@ -51,6 +51,7 @@ def test_two_initial_values_lead_to_one_solution(record):
     assert np.allclose(np.asarray(far.theta), np.asarray(near.theta), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_learner_beside_them_reaches_the_noise(record):
     fit = oa.estimate(
         record, pendulum(20.0, 0.1), learner=oa.MLP(hidden=(4,), inputs=("om",)), seed=0

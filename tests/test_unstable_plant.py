@@ -72,6 +72,7 @@ def test_what_is_said_of_it_is_of_its_segments(fit):
         assert low < true < high
 
 
+@pytest.mark.slow
 def test_a_stable_plant_and_one_that_is_given_its_segments_are_left(fit):
     u, y = balanced()
     record = oa.Record.from_arrays(u, y, sampling_time=STEP)
