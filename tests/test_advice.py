@@ -15,7 +15,13 @@ from helpers import unfolded
 from test_motion_cli import friction, orthaug
 
 import orthaug as oa
-from orthaug.commands.advice import apply_change
+from orthaug.commands.advice import (
+    Proposal,
+    ProposalErrors,
+    ValidationRows,
+    _conclude_trials,
+    apply_change,
+)
 from orthaug.reports.page_verdict import fit_verdict
 
 LAGGED = """
@@ -303,3 +309,17 @@ def test_what_a_change_explains_is_called_no_disturbance(tmp_path):
     text = {warning.code: warning.text for warning in fitted.result.warnings}["unexplained"]
     assert "physics that is missing is its likely cause" in text and first.text in text
     assert "disturbance" not in text and "noise.model" not in text
+
+
+def test_a_change_that_runs_away_still_is_no_advice():
+    """Of 1,360 and 1,120 deviations neither says anything; 0.02 instead of 1,360 does."""
+    rng = np.random.default_rng(1)
+
+    def errors(size: float) -> list[Any]:
+        return [size**2 * rng.uniform(0.5, 1.5, 60) for _ in range(3)]
+
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    tried = [ProposalErrors(Proposal("a hold", {}), errors(size)) for size in (1120.0, 0.02)]
+    advice, _ = _conclude_trials(errors(1360.0), tried, rows, 0, False)
+    assert [round(one.after, 2) for one in advice] == [0.02]

@@ -120,9 +120,9 @@ class System:
         """
         if self.integrates:
             return None
-        z = np.array([1.0 + 0j if self.step is not None else 0j])
-        found = self.response(z)
-        matrix = z.real[0] * np.eye(self.states) - self.a
+        rest = 1.0 if self.step is not None else 0.0
+        found = self.response(np.array([rest + 0j]))
+        matrix = rest * np.eye(self.states) - self.a
         inside = np.abs(np.linalg.solve(matrix, self.b))
         error = np.abs(np.linalg.inv(matrix)) @ (np.abs(matrix) @ inside)  # Skeel 1979
         least = _NOTHING * (np.abs(self.c) @ error + np.abs(self.d))

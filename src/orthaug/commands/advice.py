@@ -282,6 +282,7 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 # Errors over the output's deviation: of a run that says nothing, and of one that leaves the output
 _NO_BETTER, _RUNS_AWAY = (0.95, 3.0)
+_TAMED = 0.1  # of the error of a run that runs away, above which one still runs away
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
