@@ -84,10 +84,11 @@ def doubt(made: E) -> E:
         hidden = hidden and test.state.share > _LITTLE_BESIDE * _named_share(result)
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
-    # What is far from the data, or lacks a term that is known, needs no parameter that changes
-    named = test is None or test.is_far or _named_share(result) > _MOSTLY
-    if test is not None and test.drift is not None and not hidden and not named:
-        warnings += _drifting(fit, test.drift)
+    if test is not None and test.drift is not None and not hidden:
+        # What is far from the data, or lacks a term that is known, needs no changing parameter
+        explained = test.is_far or _named_share(result) > _MOSTLY
+        if not (explained and (unmodelled or test.found)):
+            warnings += _drifting(fit, test.drift)
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
         found["unexplained"] = _structure(fit, test, hidden=hidden)
