@@ -291,6 +291,17 @@ def stepped(rows: int, seed: int, held: int = 12) -> np.ndarray:
     return np.repeat(np.random.default_rng(seed).uniform(-1, 1, rows // held + 1), held)[:rows]
 
 
+def coil() -> oa.Motion:
+    """A coil of constant resistance."""
+    return oa.Motion.from_equations(
+        [oa.State("i", "(u - R*i)/L", start="y")],
+        [oa.Output("y", "i")],
+        [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 0.4, min=0)],
+        ["u"],
+        hold="zero-order",
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", ["sensor", "equation"])
 @pytest.mark.parametrize("heats", [0.5, 0.0])
@@ -305,13 +316,7 @@ def test_a_resistance_that_follows_the_heat_of_its_current_is_a_hidden_state(noi
         heat += 0.05 * (i**2 - heat) / 4
         shock = 0.02 * random.normal() if noise == "equation" else 0.0
         i += 0.05 * (value - (0.8 + heats * heat) * i) / 0.5 + shock
-    motion = oa.Motion.from_equations(
-        [oa.State("i", "(u - R*i)/L", start="y")],
-        [oa.Output("y", "i")],
-        [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 0.4, min=0)],
-        ["u"],
-        hold="zero-order",
-    )
+    motion = coil()
     measured = np.array(y) + (5e-3 if noise == "sensor" else 0.0) * random.normal(size=2000)
     record = oa.Record.from_arrays(u, measured, sampling_time=0.05)
     found = oa.estimate(record, motion, learner=None).diagnose()
@@ -337,13 +342,7 @@ def test_a_parameter_that_changes_over_the_record_is_named_with_both_ends():
             y.append(i)
             i += 0.05 * (value - (0.8 + rise * k / 1500) * i) / 0.5
         noisy = np.array(y) + 2e-3 * np.random.default_rng(6).normal(size=1500)
-        motion = oa.Motion.from_equations(
-            [oa.State("i", "(u - R*i)/L", start="y")],
-            [oa.Output("y", "i")],
-            [oa.PhysicalParameter("R", 1.0, min=0), oa.PhysicalParameter("L", 0.4, min=0)],
-            ["u"],
-            hold="zero-order",
-        )
+        motion = coil()
         record = oa.Record.from_arrays(u, noisy, sampling_time=0.05)
         found = oa.estimate(record, motion, learner=None).diagnose()
         said[rise] = {w.code: w.text for w in found.warnings}

@@ -44,7 +44,7 @@ _ROUNDING = 1e-7  # of the outputs' deviation: errors below that are rounding an
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 # Quantiles about which a function of a learner's feature bends
 _CENTRES = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.95)
-_STATIC = 5  # functions of one row
+_FUNCTIONS = 5  # of one row, that `_static` returns
 _MULTIPLIED = 8  # features, of which products of pairs are taken
 _LEAST_LAG = 3.0  # samples: a faster state is a lag that is missing
 _MUCH = 1.5  # times what functions of one row predict, with which memory is the cause beside them
@@ -423,7 +423,7 @@ def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[Family], l
         joined = np.concatenate([own[name] for own in signals])
         size = float(np.sqrt(np.mean(joined**2))) or 1.0
         terms = memory_terms(name, joined, step)
-        kinds = [(STATIC, (None,) * _STATIC)]
+        kinds = [(STATIC, (None,) * _FUNCTIONS)]
         kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
         for place, equation in _equations(model).doubted:
             families += [Family(equation, name, kind, own) for kind, own in kinds]

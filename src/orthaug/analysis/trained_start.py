@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import singledispatch
+from itertools import pairwise
 
 import numpy as np
 
@@ -97,7 +98,7 @@ def judged_record(fit: Estimate) -> Record:
     pieces = [
         experiment.rows(first, last)
         for experiment, own in zip(record.experiments, begins, strict=True)
-        for first, last in zip(own, [*own[1:], len(experiment)], strict=True)
+        for first, last in pairwise([*own, len(experiment)])
     ]
     return replace(record, experiments=tuple(pieces))
 
@@ -140,7 +141,7 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     each = [[0]] * len(rows) if begins is None else begins
     for experiment, own, first in zip(record.experiments, rows, each, strict=True):
         inputs = np.asarray(model.form.inputs(experiment, record))
-        bounds = zip(first, [*first[1:], len(experiment)], strict=True)
+        bounds = pairwise([*first, len(experiment)])
         pieces = [model.form.run(numbers, own[a], inputs[a:b]) for a, b in bounds]
         run = pieces[0] if len(pieces) == 1 else _joined(pieces)
         trajectories.append(model.as_trajectory(run, inputs, experiment, record))
