@@ -10,6 +10,25 @@ import orthaug as oa
 STEP = 0.01
 
 
+SPEC = f"""
+[data]
+sampling_time = {STEP}
+inputs = ["u"]
+outputs = ["y"]
+train = {{ files = ["run.csv"], rows = [0, 900] }}
+tests.last = {{ files = ["run.csv"], rows = [900, 1200] }}
+[motion.states]
+angle = {{ derivative = "speed", start = "y" }}
+speed = {{ derivative = "g*sin(angle) - d*speed + b*u", start = "derivative of y" }}
+[motion.outputs]
+y = "angle"
+[motion.parameters]
+g = {{ initial = 15, min = 0 }}
+d = {{ initial = 1, min = 0 }}
+b = {{ initial = 2, min = 0 }}
+"""
+
+
 def balanced(rows: int = 1200, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """A rod held upright: φ'' = 30 sin φ − 0.5 φ' + 4 u under feedback of angle and speed."""
     random = np.random.default_rng(seed)
@@ -70,6 +89,17 @@ def test_what_is_said_of_it_is_of_its_segments(fit):
     for row, true in zip(found.parameters, (30, 0.5, 4), strict=True):
         low, high = row.ci95
         assert low < true < high
+
+
+def test_the_page_does_not_judge_it_by_free_runs_of_the_record(tmp_path):
+    np.savetxt(
+        tmp_path / "run.csv", np.column_stack(balanced()), delimiter=",", header="u,y", comments=""
+    )
+    (tmp_path / "spec.toml").write_text(SPEC)
+    oa.fit_spec(tmp_path / "spec.toml", out=tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "the plant is unstable, so that no free run follows a whole record" in page
+    assert "Do not use the model" not in page and "Use it to predict the next sample" in page
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ _MOST_KEYS = 4  # of settings in a sentence
 _MOST_DOUBTS = 3  # in the first sentence
 _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
+_UNSTABLE = "unstable_plant"
 _RAN_AWAY = "free_run_diverged"
 # Of models that are as good as each other these are taken first
 _TIED = ("orthogonal", "physics alone")
@@ -50,18 +51,21 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     """Return the verdict of a fit, from its own findings."""
     doubts = list(_doubts(result, result.data))
     error, part = _worst_score(result.scores)
+    unstable = _has_warning(result, _UNSTABLE)  # no score of a free run judges it
     bad = (
         _has_warning(result, _RAN_AWAY)
-        or (error is not None and error > _POOR)
+        or (error is not None and error > _POOR and not unstable)
         or _code(result) == "hurts"
     )
-    level = "bad" if bad else "care" if doubts else "good"
+    level = "bad" if bad else "care" if doubts or unstable else "good"
     opening = {
         "good": "The model is reliable",
         "care": "The model is usable with reservations",
         "bad": "Do not use the model as it is",
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
+    if unstable:
+        shown = ": the plant is unstable, so that no free run follows a whole record"
     because = (
         f"{', but ' if level == 'care' else '; '}{join_words(doubts[:_MOST_DOUBTS])}"
         if doubts
@@ -360,7 +364,7 @@ def _use_text(result: FitResult, level: str) -> str:
         )
     if level == "bad" and not (known and predicts):
         return "Use it only to search for missing physics."
-    if level == "bad":
+    if level == "bad" or _has_warning(result, _UNSTABLE):
         text = "predict the next sample"
     else:
         text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
