@@ -115,6 +115,16 @@ def _programs_are_let_go() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def _programs_are_traced_anew() -> Iterator[None]:
+    """Tests replace functions and constants: no program is read that another test has traced."""
+    from orthaug._base import jax as programs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programs, "keep_traced_programs", lambda folder: None)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
 def _defects_are_seen() -> Iterator[None]:
     """A user keeps a training behind which an analysis fails; a test fails."""
     from orthaug.analysis import attempt

@@ -199,6 +199,64 @@ def test_segments_of_a_discrete_plant_begin_at_estimated_states_of_its_controlle
     assert rng is not None and fit.model.state_names == ("x", "controller_1")
 
 
+def floating_ball(noise: float, rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
+    """Return reference gaps, and measured gaps and currents (N, 2), of a ball under a magnet."""
+    rng, step = np.random.default_rng(5), 0.002
+    r = 0.010 + np.repeat(rng.uniform(-0.0015, 0.0015, rows // 60), 60)
+    x, integral, before, found = np.array([0.010, 0.0]), 0.0, 0.0, []
+
+    def field(x: np.ndarray, u: float) -> np.ndarray:
+        return np.array([x[1], 9.81 - 0.002 * (u / x[0]) ** 2])
+
+    for k in range(rows):
+        y = x[0] + noise * rng.normal()
+        e = r[k] - y
+        u = 0.7003 - (400 * e + 9 * (e - before) / step + 1500 * integral)
+        u = min(max(u, 0.05), 3.0)
+        found.append((y, u))
+        integral, before = integral + step * e, e
+        for _ in range(4):
+            k1 = field(x, u)
+            k2 = field(x + step / 8 * k1, u)
+            k3 = field(x + step / 8 * k2, u)
+            x = x + step / 24 * (k1 + 2 * k2 + 2 * k3 + field(x + step / 4 * k3, u))
+    return r, np.array(found)
+
+
+@pytest.mark.parametrize("outputs", [["gap"], ["gap", "current"]])
+def test_predictions_start_from_what_the_controller_has_read(outputs: list[str]) -> None:
+    noise, (r, measured) = 1e-5, floating_ball(1e-5)
+    plant = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", "gap"),
+            oa.State("v", "9.81 - C*(current/x)**2", "derivative of gap"),
+        ],
+        [oa.Output("gap", "x")],
+        [oa.PhysicalParameter("C", 0.0019)],
+        ["current"],
+        substeps=4,
+    )
+    controller = oa.Controller.from_equations(
+        {"current": "min(max(0.7003 - (400*e + 9*(e - before)/Ts + 1500*sum), 0.05), 3)"},
+        [oa.State("sum", "sum + e*Ts", 0.0), oa.State("before", "e", 0.0)],
+        define={"e": "reference - gap"},
+    )
+    data = oa.Record.from_arrays(
+        r,
+        measured[:, : len(outputs)],
+        sampling_time=0.002,
+        inputs=["reference"],
+        outputs=outputs,
+    )
+    fit = oa.estimate(data, plant, learner=None, controller=controller, criterion=WHOLE)
+    for horizon in (1, 10):
+        error = fit.model.predict(data, horizon=horizon).errors[:, 0]
+        error = error[np.isfinite(error)]
+        assert len(error) > 400
+        assert np.abs(error).max() < 30 * noise  # the plant follows the noise that the law reads
+        assert error.std() < 5 * noise
+
+
 # ---------------------------------------------------------------- learner, saved models, code
 
 

@@ -253,6 +253,7 @@ def test_a_limit_that_the_physics_has_is_no_end_of_a_range():
     )
     record = oa.Record.from_arrays(u, y, sampling_time=0.05, outputs=["p", "s"], inputs=["u"])
     assert "saturated_output" in {w.code for w in data_warnings(record)}
+    assert "saturated_output" not in {w.code for w in data_warnings(record, limited=["s"])}
     found = oa.estimate(record, motion, learner=None).diagnose()
     assert found.scores["train"].simulation.nrmse[1] < 0.2
     assert "saturated_output" not in {w.code for w in found.warnings}

@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import gc
 import hashlib
+import inspect
 import os
 import sys
 import threading
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import PrecisionError
+from orthaug._base.kept_programs import Call, KeptPrograms
 from orthaug._base.memory import return_free_memory
 
 if TYPE_CHECKING:
@@ -116,9 +118,16 @@ class _Compiled:
         functools.update_wrapper(self, function)
         self._function, self._effort, self._options = function, effort, options
         self._lock = threading.Lock()
+        named = "<locals>" not in function.__qualname__
+        self._may_be_kept = named and options.keys() <= {"static_argnames", "static_argnums"}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        if _are_small((args, kwargs)) and _efforts_known():
+        small = _are_small((args, kwargs))
+        if small is not None and self._may_be_kept and _kept:
+            result = self._of_kept(small, args, kwargs)
+            if result is not NotImplemented:
+                return result
+        if small and _efforts_known():
             try:
                 return self._with_less_effort(*args, **kwargs)
             except ValueError as error:  # called while another program is traced
@@ -134,6 +143,29 @@ class _Compiled:
         if "<locals>" in self._function.__qualname__:
             return type(self), (self._function, self._effort, self._options)
         return self._function.__qualname__
+
+    def _of_kept(self, small: bool, args: Any, kwargs: Any) -> Any:
+        """Return the result of a program on disk; `NotImplemented` without one."""
+        if not _efforts_known() or len(_real_jax().devices()) > 1:
+            return NotImplemented
+        call = Call.of(self._signature, self._static, args, kwargs)
+        return _kept[0].call(self._function, call, self._effort if small else None)
+
+    @functools.cached_property
+    def _signature(self) -> inspect.Signature:
+        return inspect.signature(self._function)
+
+    @functools.cached_property
+    def _static(self) -> tuple[str, ...]:
+        """Names of the static arguments."""
+        names = self._options.get("static_argnames", ())
+        numbers = self._options.get("static_argnums", ())
+        all_names = list(self._signature.parameters)
+        by_number = (numbers,) if isinstance(numbers, int) else numbers
+        return (
+            *((names,) if isinstance(names, str) else names),
+            *(all_names[i] for i in by_number),
+        )
 
     @functools.cached_property
     def _plain(self) -> Callable[..., Any]:
@@ -173,14 +205,16 @@ def _efforts_known() -> bool:
     return True
 
 
-def _are_small(arguments: Any) -> bool:
-    """Return whether all arguments are known and small."""
+def _are_small(arguments: Any) -> bool | None:
+    """Return whether all arguments are small; None if one is not known yet."""
     from jax.core import Tracer
 
+    small = True
     for leaf in _real_jax().tree.leaves(arguments):
-        if isinstance(leaf, Tracer) or getattr(leaf, "size", 0) > _SMALL:
-            return False
-    return True
+        if isinstance(leaf, Tracer):
+            return None
+        small = small and getattr(leaf, "size", 0) <= _SMALL
+    return small
 
 
 def starts() -> bool:
@@ -273,6 +307,8 @@ def release_programs(share: float = _MOST_MAPS) -> bool:
         most = _MAPS
     if held.read_bytes().count(b"\n") <= share * most:
         return False
+    for programs in _kept:
+        programs.clear()
     jax.clear_caches()
     gc.collect()
     return_free_memory()
@@ -291,6 +327,20 @@ def use_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     _check_cached_programs()
+    keep_traced_programs(folder)
+
+
+_kept: list[KeptPrograms] = []  # one where traced programs are kept
+
+
+def keep_traced_programs(folder: str) -> None:
+    """Read traced programs from a folder from now on, and write there what is traced."""
+    try:
+        from jax._src.compilation_cache import get_file_cache
+    except ImportError:  # another version of JAX: its functions are traced in each process
+        return
+    cache = get_file_cache(folder)
+    _kept[:] = [] if cache is None else [KeptPrograms(cache[0])]
 
 
 class ChecksummedCache:

@@ -149,9 +149,9 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
 
     Of physics that is linear in θ they say what a fit without them gives.
     """
-    lagged = isinstance(problem, Problem)
-    without = partial(fit_without, problem) if lagged else (lambda samples: "")
-    return list(data_warnings(problem.record, without))
+    if isinstance(problem, Problem):
+        return list(data_warnings(problem.record, partial(fit_without, problem)))
+    return list(data_warnings(problem.record, limited=problem.motion.held))
 
 
 def _problem_of(fit: Estimate) -> Any:

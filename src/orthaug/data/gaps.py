@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,15 +74,20 @@ def held_warnings(record: Record) -> list[Warning]:
     return found
 
 
-def saturation_warnings(record: Record, model: Matrix | None = None) -> list[Warning]:
+def saturation_warnings(
+    record: Record, model: Matrix | None = None, limited: Sequence[str] = ()
+) -> list[Warning]:
     """Return a warning of each output that stays at its largest or smallest value for many rows.
 
     Args:
         model: a free run's outputs (N, ny) on the rows of a complete record: a limit that it
             reaches on about the same rows is in the physics, and no warning is due.
+        limited: names of outputs whose limits are known, as of what a controller sets.
     """
     found = []
     for j, output in enumerate(record.outputs):
+        if output.name in limited:
+            continue
         values = record.measured[j]
         limits = Column(output.name, output.name, output.unit, values).limits
         ends = [(value, rows) for value, rows in limits if rows >= _SATURATED * len(values)]

@@ -8,7 +8,7 @@ physics.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,12 +144,15 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
 
 
 def data_warnings(
-    record: Record, effect: Callable[[tuple[WildSample, ...]], str] | None = None
+    record: Record,
+    effect: Callable[[tuple[WildSample, ...]], str] | None = None,
+    limited: Sequence[str] = (),
 ) -> list[Warning]:
     """Return warnings of wild samples, doubled rows, angles that wrap, and constant outputs.
 
     Args:
         effect: says in a sentence what a fit without some samples gives.
+        limited: names of outputs whose limits are known, as of what a controller sets.
     """
     complete, record = complete_record(record), filled_record(record)
     found, samples = [], wild_samples(record)
@@ -162,7 +165,8 @@ def data_warnings(
         return found
     found += _repeat_warnings(complete) or held_warnings(complete)
     found += wrap_warnings(complete) + _same_signal_warnings(complete)
-    return [*found, *_frozen_warnings(complete), *saturation_warnings(complete)]
+    limits = saturation_warnings(complete, limited=limited)
+    return [*found, *_frozen_warnings(complete), *limits]
 
 
 def _same_signal_warnings(record: Record) -> list[Warning]:

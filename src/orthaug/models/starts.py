@@ -17,6 +17,7 @@ from orthaug._base.checks import Matrix, Vector, as_signal
 from orthaug._base.errors import InputError
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_rows
+from orthaug.models.controller_states import along_measured
 from orthaug.models.dynamics import Numbers, Parts, in_batches, last_outputs
 from orthaug.models.filters import LaggedFilter, MotionFilter
 from orthaug.models.kalman import Filter
@@ -33,6 +34,8 @@ FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 _GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
+_LOST = 4.0  # times the usual misfit: the start of a window may be wrong
+_KNOWN = 1e-9  # times how far a state may be from its guess, where that is known
 
 
 class Predicted(NamedTuple):
@@ -321,11 +324,13 @@ class EstimatedStates:
         form, numbers, steps = model.form, model.numbers, window + horizon
         inputs = form.inputs(experiment, record)
         begins = np.arange(len(inputs) - steps + 1)
-        states = self._begin(model, experiment, record, begins)
+        states, free = self._begin(model, experiment, record, begins)
         ends = [(form, numbers)]
         if form.learns:
             alone = model.physics_only
             ends.append((alone.form, alone.numbers))
+        sampled = form.motion.discrete_states  # a controller's states follow from the record
+        known = np.array([name in sampled for name in form.motion.names_of_states])
         length, pieces = padded_steps(steps), []  # few horizons have programs of their own
         for begin in range(0, len(begins), _SIDE_BY_SIDE):
             chosen = begins[begin : begin + _SIDE_BY_SIDE]
@@ -336,15 +341,14 @@ class EstimatedStates:
             windows = Windows(
                 following[:window], target, np.ones((window, len(padded)), dtype=bool)
             )
-            settled = settle(
+            settled = _settle_from_either(
                 form,
                 numbers,
-                states[padded].T,
+                (states[padded], free[padded]),
                 windows,
                 model.weight,
-                self.loose,
-                _WINDOW_ITERATIONS,
-            )[0]
+                np.where(known, self.loose * _KNOWN, self.loose),
+            )
             pieces.append(
                 [
                     np.asarray(last_outputs(*end, settled, following, steps).total).T[: len(chosen)]
@@ -409,20 +413,28 @@ class EstimatedStates:
         experiment: Experiment,
         record: Record,
         rows: Vector,
-    ) -> Matrix:
-        """Return guesses of the states at some rows; hidden ones are those of the free run."""
+    ) -> tuple[Matrix, Matrix]:
+        """Return guesses of the states at some rows, and those of the free run.
+
+        Hidden ones are the free run's; a controller's follow from the record.
+        """
         form = model.form
-        run = form.run(
-            model.numbers,
-            self.first(model, experiment, record, "measured"),
-            form.inputs(experiment, record),
-        ).states[rows]
-        states = form.start(experiment.outputs, rows)
-        hidden = [i for i, state in enumerate(form.motion.states) if state.from_output is None]
+        inputs = form.inputs(experiment, record)
+        start = self.first(model, experiment, record, "measured")
+        free = form.run(model.numbers, start, inputs).states
+        if form.motion.discrete_states:
+            free = along_measured(form, model.numbers, free, inputs, experiment.outputs)
+        run, states = free[rows], form.start(experiment.outputs, rows)
+        sampled = form.motion.discrete_states
+        hidden = [
+            i
+            for i, state in enumerate(form.motion.states)
+            if state.from_output is None or state.name in sampled
+        ]
         with np.errstate(all="ignore"):
             known = np.isfinite(run).all(axis=1, keepdims=True)
         states[:, hidden] = np.where(known, run, states)[:, hidden]
-        return states
+        return states, np.where(known, run, states)
 
     def points(self, model: RecordModel[MotionDynamics], record: Record) -> Matrix:
         """Return the finite states and inputs (N, nx + nu) of the free run."""
@@ -437,6 +449,28 @@ class EstimatedStates:
             )
         points = np.concatenate(pieces)
         return points[np.isfinite(points).all(axis=1)]
+
+
+def _settle_from_either(
+    form: MotionDynamics,
+    numbers: Numbers,
+    begins: tuple[Matrix, Matrix],
+    windows: Windows,
+    weight: Matrix,
+    loose: Vector,
+) -> Float[np.ndarray, "nx m"]:
+    """Return the states by which runs follow the windows best, from two guesses (m, nx).
+
+    The second is tried where the first ends far above the others: a derivative of a noisy output
+    can be so wrong that the run from it leaves.
+    """
+    first, second = begins
+    settled, misfit = settle(form, numbers, first.T, windows, weight, loose, _WINDOW_ITERATIONS)
+    usual = np.median(misfit)
+    if not (misfit > _LOST * usual).any():
+        return settled
+    again, other = settle(form, numbers, second.T, windows, weight, loose, _WINDOW_ITERATIONS)
+    return np.where(other < misfit, again, settled)
 
 
 def _last_of(
