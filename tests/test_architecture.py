@@ -56,6 +56,7 @@ ENTRIES = {
     "commands.": "a command, or a part of the page, has a file of its own",
 }
 CONCEPTS = {
+    "_base.kept_programs": "traced programs on disk",
     "models.controller_states": "what a controller has read until a row",
     "data.units": "units, read by a library",
     "selection.linear_runs": "linear models by the error of their free run",

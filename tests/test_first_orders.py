@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import random
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -112,3 +115,22 @@ def test_an_output_has_the_past_of_another_where_that_drives_it(seed):
 def test_outputs_that_do_not_act_on_each_other_have_no_past_of_the_other(seed):
     model = first_model(room(seed, 0.0))
     assert model is not None and not model.across
+
+
+def test_a_poor_run_does_not_correct_the_lag_that_a_test_found() -> None:
+    """An arm with dry friction and two rows of dead time: linear runs miss half, best from lag 0."""
+    rng = random.Random(7)
+    levels = [round(rng.uniform(-2.5, 2.5), 2) for _ in range(150)]
+    volts = np.repeat(levels, 10)[:1125]
+    angle, speed, y = 0.0, 0.0, []
+    for volt in [0.0, 0.0, *volts[:-2]]:
+        y.append(math.degrees(angle) + rng.gauss(0, 0.01))
+        for _ in range(20):
+            speed += 0.001 * (
+                9 * volt - 0.6 * speed - 40 * math.sin(angle) - 4 * math.tanh(speed / 0.05)
+            )
+            angle += 0.001 * speed
+    model = first_model(Record.from_arrays(volts, np.array(y), sampling_time=0.02))
+    assert model is not None
+    assert model.orders.nk == (3,)
+    assert min(model.free_run) > 0.3

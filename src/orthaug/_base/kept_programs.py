@@ -238,7 +238,7 @@ class KeptPrograms:
             (size,) = struct.unpack_from("<I", kept)
             result = json.loads(kept[4 : 4 + size])
             exported = export.deserialize(bytearray(kept[4 + size :]))
-        options = {} if effort is None else {"compiler_options": dict(effort)}
+        options: Any = {} if effort is None else {"compiler_options": dict(effort)}
         return Program(jax.jit(exported.call, **options), result)
 
 

@@ -31,7 +31,7 @@ from orthaug.models.learners import Learner, declared
 from orthaug.models.rows import InMemory
 from orthaug.models.tasks import runs_on
 from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.problem import PosedProblem, Problem
+from orthaug.physics.problem import MotionProblem, PosedProblem, Problem
 
 DEFAULT_BLOCKS = 4
 """Blocks of cross-validation where no part is held out."""
@@ -151,7 +151,8 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
     """
     if isinstance(problem, Problem):
         return list(data_warnings(problem.record, partial(fit_without, problem)))
-    return list(data_warnings(problem.record, limited=problem.motion.held))
+    set_by_controller = problem.motion.held if isinstance(problem, MotionProblem) else ()
+    return list(data_warnings(problem.record, limited=set_by_controller))
 
 
 def _problem_of(fit: Estimate) -> Any:

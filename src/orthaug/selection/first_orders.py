@@ -40,6 +40,9 @@ _PER_DELAY = 6  # rows of the longest experiment at least
 _SURE = 3.1  # standard errors: 5 % for 21 lags together
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
 _TELLING = 0.7  # error over the output's deviation, from which on a free run ranks no orders
+# Error over the output's deviation, below which a run may correct the test of the first lag: of a
+# model that misses more, as a linear one beside friction, the best delay is not the plant's
+_FOLLOWS = 0.3
 _RESTARTED = (300, 100, 30, 10)  # rows after which a run is started again where longer ones do not
 _DOUBTFUL = 0.1  # of the output's deviation: above, refinement begins at other poles, too
 _DYNAMIC = 0.25  # of the error without past outputs, below which runs with them are believed
@@ -79,7 +82,8 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
     Where all of them drift away, as those of an integrator or a light damping may, runs that start
     again from measured lags decide: the longest whose best follows the output. The first lags are
-    the significant ones, unless from 1 or 0 on the best free run is clearly better. Every model
+    the significant ones, unless from 1 or 0 on the best free run follows and is clearly better. Every
+    model
     that is tried has a constant: without one, further lags make up for the level of the signals.
 
     Args:
@@ -318,7 +322,9 @@ def _best_choice(
     chosen: _Choice | None = None
     for nk in first_lags:  # a test may miss them
         found = _smallest(record, excited, nk, length, least, poles)
-        if found is not None and (chosen is None or found[0] * _BETTER < chosen[0]):
+        if found is None:
+            continue
+        if chosen is None or (found[0] < _FOLLOWS and found[0] * _BETTER < chosen[0]):
             chosen = found
     return chosen
 
