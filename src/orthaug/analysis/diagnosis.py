@@ -67,6 +67,7 @@ _LITTLE_COLOUR = 0.2
 _LITTLE_FOLLOWED = 0.1  # correlation of such errors with an input
 _AS_GOOD = 1.05  # free-run error / one-step error up to which measured lags add nothing
 _SMALL = 0.05  # of the residual's variance: what could be predicted below that is a small effect
+_SLIGHT = 0.01  # of it, by one missing term: less is not worth naming
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
 _HOLD = 0.5  # share of the squares in wild rows
@@ -191,6 +192,7 @@ def _of_motion(
     curved = {test.name: test.curved_over(_SMALL) for test in tests if test.curved_over(_SMALL)}
     lacks = missing if missing is not None and missing.found(_LEVEL, _SMALL) else None
     several = missing if missing is not None and missing.scattered else None
+    slight = missing if missing is not None and missing.found(_LEVEL, _SLIGHT) else None
     explained = any(share.inputs > _SMALL for share in shares) or bool(curved)
     explained = explained or lacks is not None or several is not None
     white = all(test.practically_white() for test in tests)
@@ -203,7 +205,7 @@ def _of_motion(
     )
     verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
     text = free_run_words(
-        verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse
+        verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse, slight
     )
     warnings = [restarted[1]] if restarted else []
     warnings += [one.warning for one in late]

@@ -33,6 +33,7 @@ NOISE_ONLY = (
     *("few_frequencies", "little_left", "output_without_learner", "hidden_state"),
 )
 """Codes of warnings that leave intervals of noise alone."""
+_SURE_TERM = 0.01  # probability of no missing term, below which the best is named
 _FAR = 3.0  # times its value, by which no linear step moves a parameter credibly
 _NAMED = 12  # parameters in a warning
 _MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judged beside it
@@ -183,13 +184,11 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             "noise: it is too far from the data to say what is missing"
         )
     else:
-        best = max(
-            (one for one in (test.static, test.memory) if one is not None),
-            key=lambda one: one.share,
-        )
+        best = test.likeliest
         name = f"a further lag of {best.on}" if test.is_a_lag(best) else best.name
+        term = _term_of(result, best) if best is test.static else ""
         what = (
-            f"the model's error contains more than noise: {name} in {best.equation} predicts "
+            f"the model's error contains more than noise: {name} in {best.equation}{term} predicts "
             f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
             "own past predicts"
         )
@@ -207,6 +206,16 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
         else "Missing physics may have moved the parameters."
     )
     return f"{what}. {moved} {remedy}"
+
+
+def _term_of(result: Findings, family: FamilyTest) -> str:
+    """Return the missing term that a function of one variable is, in brackets; or nothing."""
+    missing = result.residuals.missing if result.residuals is not None else None
+    if missing is None or not missing.terms or missing.p > _SURE_TERM:
+        return ""
+    best = missing.terms[0]
+    same = (best.equation, best.variable) == (family.equation, family.on)
+    return f" ({best.expression}, most likely)" if same else ""
 
 
 def with_found_change(fit: Any, result: Findings, found: str) -> list[Warning]:

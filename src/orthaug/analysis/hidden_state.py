@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -108,6 +108,15 @@ class StructureTest:
         near = _NEARLY * self.memory.share
         others = (one for one in self.families if one.on not in self.delayed and one.sure)
         return next((one for one in others if one.share >= near), None)
+
+    @property
+    def likeliest(self) -> FamilyTest:
+        """The family to name: a function of one row, unless memory predicts clearly more."""
+        assert self.static is not None or self.memory is not None
+        if self.static is None or self.memory is None:
+            return cast(FamilyTest, self.static or self.memory)
+        static = self.static.share >= _NEARLY * self.memory.share
+        return self.static if static else self.memory
 
     @property
     def has_memory(self) -> bool:

@@ -404,10 +404,12 @@ def free_run_words(
     lacks: MissingTest | None,
     late: tuple[LateInput, ...],
     coarse: QuantisedOutput | None = None,
+    slight: MissingTest | None = None,
 ) -> str:
     """Return the verdict on a motion's free run in words, with its reason.
 
     Args:
+        slight: terms that surely explain a little of it.
         coarse: the steps of the outputs, where these are most of the error.
     """
     units = {c.name: c.unit for c in fit.problem.record.outputs}
@@ -428,14 +430,28 @@ def free_run_words(
         return f"{subject} ({sizes}) {noise}{small_effects(tests, shares)}"
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
-        no_input = "no input, " if fit.problem.motion.inputs else ""
+        inputs = fit.problem.motion.inputs
         colour = describe_colour(tests, shares)
         remedy = "" if modelled or fit.problem.motion.held else _BY_INNOVATIONS
         fed = "sensor noise that the controller feeds back, " if fit.problem.motion.held else ""
+        no_term = (
+            f"{'no input, ' if inputs else ''}no state at the same instant and no simple missing "
+            "term behind it. "
+        )
+        cause = "Its cause is"
+        if slight is not None:
+            best = slight.terms[0]
+            named = f"{best}"
+            no_term = (
+                f"{'no input and ' if inputs else ''}no state at the same instant behind it. "
+                f"{named[:1].upper()}{named[1:]}. This would explain "
+                f"{percent(best.share)} of its mean square: little, but it may move parameters. "
+            )
+            cause = "The cause of the rest is"
         return (
-            f"{subject} ({sizes}) is coloured ({colour}). The tests of the residual find {no_input}"
-            f"no state at the same instant and no simple missing term behind it. Its cause is {fed}"
-            f"disturbances, or physics missing in an equation {learner}.{remedy}"
+            f"{subject} ({sizes}) is coloured ({colour}). The tests of the residual find "
+            f"{no_term}{cause} {fed}disturbances, or physics missing in an equation "
+            f"{learner}.{remedy}"
         )
     if late:
         return (

@@ -82,9 +82,9 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     The orders are the smallest whose free run is within 5 % of the best of up to 4 lags a channel.
     Where all of them drift away, as those of an integrator or a light damping may, runs that start
     again from measured lags decide: the longest whose best follows the output. The first lags are
-    the significant ones, unless from 1 or 0 on the best free run follows and is clearly better. Every
-    model
-    that is tried has a constant: without one, further lags make up for the level of the signals.
+    the significant ones, unless from 1 or 0 on the best free run follows and is clearly better.
+    Every model that is tried has a constant: without one, further lags make up for the level of the
+    signals.
 
     Args:
         direct: whether an input may act in its own row. Under feedback the controller makes that
