@@ -164,6 +164,10 @@ def _analyse(
         fit = attempt(
             "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
         )
+        # Wider errors may leave a parameter without an interval
+        gone = [one for one in plain.warnings if one not in fit.warnings]
+        warnings[:] = [one for one in warnings if one not in gone]
+        warnings += [one for one in fit.warnings if one not in plain.warnings]
         if fit.std is not None:  # the robust ones need no covariance of the weights
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
         warnings += closed_loop(evidence.train.record, evidence.method(fit.criterion))

@@ -245,12 +245,9 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     hurt = {where for (where, _), code in zip(groups, codes, strict=True) if code == "hurts"}
     beyond = [e for e in extrapolation if e.part in hurt and e.share > _MUCH]
     ratio = ratios[codes.index(worst)]
-    likely = ratio.value < _LIKELY and ratio.high > 1
     opening = {
         "helps": "The learner helps",
-        "no_help": "It is undecided whether the learner helps"
-        if likely
-        else "The learner does not help",
+        "no_help": _no_help(ratio),
         "hurts": "The learner hurts in extrapolation" if beyond else "The learner hurts",
     }[worst]
     reasons = (
@@ -260,6 +257,15 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
     )
     text = ". ".join([opening, *reasons]) + "."
     return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratio)
+
+
+def _no_help(ratio: Ratio) -> str:
+    """Return the opening of a verdict on a learner that does not help, or not by much."""
+    if ratio.low < ratio.high < 1:
+        return "The learner lowers the free run's error surely, but by little"
+    if ratio.value < _LIKELY and ratio.high > 1:
+        return "It is undecided whether the learner helps"
+    return "The learner does not help"
 
 
 def _ratio(group: Sequence[Trial], alone: float, model: float) -> Ratio:

@@ -304,8 +304,10 @@ def _doubts(
         )
         if not learns:
             text = (
-                f"not identified: {', '.join(unseen)}. Other values of them together give the "
-                "same outputs, so there is no interval; give some of them as constants."
+                f"not identified: {', '.join(unseen)}. Other values, with others of the other "
+                "parameters, give nearly the same outputs, so there is no interval. Give some of "
+                "them as constants, or record data that depend more on "
+                f"{'it' if len(unseen) == 1 else 'them'}."
             )
         warnings.append(Warning("not_identified", text))
     return warnings
