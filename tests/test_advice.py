@@ -323,3 +323,61 @@ def test_a_change_that_runs_away_still_is_no_advice():
     tried = [ProposalErrors(Proposal("a hold", {}), errors(size)) for size in (1120.0, 0.02)]
     advice, _ = _conclude_trials(errors(1360.0), tried, rows, 0, False)
     assert [round(one.after, 2) for one in advice] == [0.02]
+
+
+CRANE = """
+[data]
+sampling_time = 0.02
+inputs = ["F"]
+outputs = ["pos", "ang"]
+train = { files = ["run.csv"] }
+[motion.states]
+p = { derivative = "v", start = "pos" }
+v = { derivative = "push", start = "derivative of pos" }
+th = { derivative = "w", start = "ang" }
+w = { derivative = "-(9.81*sin(th) + push*cos(th))/0.8 - 0.2*w", start = "derivative of ang" }
+[motion.define]
+push = "(F - c*v + 0.8*m*w**2*sin(th) + 9.81*m*sin(th)*cos(th))/(M + m*sin(th)**2)"
+[motion.outputs]
+pos = "p"
+ang = "th"
+[motion.parameters]
+M = { initial = 4, min = 0 }
+m = { initial = 1.5, min = 0 }
+c = { initial = 3, min = 0 }
+[learner]
+kind = "none"
+"""
+
+
+def test_friction_that_acts_as_an_input_does_is_named_and_advised_beside_it(tmp_path):
+    """A crane with dry friction of 4 N on its trolley, which is in the swing's equation, too."""
+    rng = np.random.default_rng(4)
+    u, x, rows = np.repeat(rng.uniform(-20, 20, 50), 16), np.zeros(4), []
+
+    def field(x: np.ndarray, force: float) -> np.ndarray:
+        _, v, th, w = x
+        pull = force - 2 * v - 4 * np.tanh(v / 0.01) + np.sin(th) * (w**2 * 0.8 + 9.81 * np.cos(th))
+        push = pull / (5 + np.sin(th) ** 2)
+        return np.array([v, push, w, -(9.81 * np.sin(th) + push * np.cos(th)) / 0.8 - 0.2 * w])
+
+    for force in u:
+        rows.append([force, x[0], x[2]])
+        for _ in range(20):
+            mid = x + 5e-4 * field(x, force)
+            x = x + 1e-3 * field(mid, force)
+    data = np.array(rows)
+    data[:, 1:] += 5e-4 * rng.normal(size=(len(data), 2))
+    spec = put(tmp_path, CRANE, data, "F,pos,ang")
+    code, out, err = orthaug("fit", spec, "--out", tmp_path / "fit")
+    assert code == 0, err
+    said = unfolded(out)
+    assert "beside the input F acts something odd in v with a jump at 0, as dry friction" in said
+    assert "Next: With the term sign(v) beside the input F" in said
+    result = json.loads((tmp_path / "fit" / "result.json").read_text())
+    term = result["residuals"]["missing"]["terms"][0]
+    assert (term["equation"], term["output"], term["beside"]) == (None, None, "F")
+    assert term["coefficient"] == pytest.approx(-4, rel=0.3)
+    advice = result["advice"][0]
+    assert advice["change"]["motion.define.push"].startswith("((F + size*(sign(v))) - c*v")
+    assert advice["after"] < 0.3 * advice["before"]

@@ -611,4 +611,5 @@ def test_no_interval_is_spoken_of_where_none_is_given():
     texts = {warning.code: warning.text for warning in found.warnings}
     assert all(row.ci95 is None for row in found.parameters)
     assert texts["coloured_residual"].endswith("Missing physics may have moved the parameters.")
+    assert texts.pop("too_long_memory").startswith("no standard errors and no intervals")
     assert not any("ntervals" in text for text in texts.values())

@@ -28,8 +28,10 @@ from orthaug.inference.linearization import Certificate, Linearization
 RemovedBy = Literal["learner", "learner and measure", "learner in part", "measure", "nothing"]
 
 
-def place_of(equation: str | None, output: str | None) -> str:
-    """Return where a term stands, in words: the equation of a state, or of an output."""
+def place_of(equation: str | None, output: str | None, beside: str | None = None) -> str:
+    """Return where a term is, in words: the equation of a state or an output, or an input."""
+    if beside is not None:
+        return f"the input {beside}"
     return (
         f"the equation of the output {output}"
         if equation is None

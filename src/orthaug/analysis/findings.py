@@ -141,10 +141,14 @@ class SuspectResult(Content):
 
 
 class MissingTermResult(Content):
-    """A term that an equation of a motion may lack; `equation` is None of one of an `output`."""
+    """A term that an equation of a motion may lack.
+
+    `equation` is None of one of an `output`, and of one that acts as the input `beside` does.
+    """
 
     equation: str | None
     output: str | None = None
+    beside: str | None = None
     variable: str | None
     shape: str
     coefficient: Number
@@ -157,8 +161,13 @@ class MissingTermResult(Content):
 
     @property
     def place(self) -> str:
-        """Where the term stands, in words."""
-        return place_of(self.equation, self.output)
+        """Where the term is, in words."""
+        return place_of(self.equation, self.output, self.beside)
+
+    @property
+    def where(self) -> str:
+        """The same with its preposition."""
+        return f"{'in' if self.beside is None else 'beside'} {self.place}"
 
 
 class MissingResult(Content):

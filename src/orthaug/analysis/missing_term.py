@@ -33,9 +33,9 @@ _AGAINST = {
 class MissingTerm:
     """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
-    `equation` is None of a term of an output, which `output` names then. `coefficient` is in the
-    units of equation and variable, `share` that of the errors' variance,
-    less what chance explains.
+    `equation` is None of a term of an output, which `output` names then, and of one that acts as
+    the input `beside` does, in all equations that have it. `coefficient` is in the units of
+    equation and variable, `share` that of the errors' variance, less what chance explains.
     """
 
     equation: str | None
@@ -59,11 +59,17 @@ class MissingTerm:
     """What the term acts against: "movement" where it slows its variable down, "displacement"
     where it drives that back by way of its derivative; None where it does neither.
     """
+    beside: str | None = None
 
     @property
     def place(self) -> str:
-        """Where the term stands, in words."""
-        return place_of(self.equation, self.output)
+        """Where the term is, in words."""
+        return place_of(self.equation, self.output, self.beside)
+
+    @property
+    def where(self) -> str:
+        """The same with its preposition."""
+        return f"{'in' if self.beside is None else 'beside'} {self.place}"
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -113,6 +119,8 @@ class MissingTerm:
         return same and self.reference is not None and other.reference is not None
 
     def __str__(self) -> str:
+        if self.beside is not None:
+            return f"beside {self.place} acts something {self.meaning}: {self.expression}"
         meaning = self.meaning  # a sensor has no springs and no friction
         meaning = meaning if self.equation is not None else meaning.partition(", as")[0]
         return f"{self.place} lacks something {meaning}: {self.expression}"

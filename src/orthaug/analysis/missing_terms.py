@@ -26,7 +26,12 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
 from orthaug.analysis.missing_term import BEYOND, POWERS, SHAPES, MissingTerm
 from orthaug.analysis.suspects import changes_sign
-from orthaug.analysis.term_sensitivities import Sensitivities, Terms, sensitivities
+from orthaug.analysis.term_sensitivities import (
+    Sensitivities,
+    Terms,
+    input_slopes,
+    sensitivities,
+)
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.whiteness import whitening_filter
 from orthaug.physics.motion import Motion
@@ -52,6 +57,7 @@ _LESS = 0.6
 # Of its gain, of friction or drag that pushes along a movement, and of drag of no movement: beside
 # a damper the right sign has nearly the same effect, and a cubic spring is nearly a square one
 _UNLIKELY = 0.8
+_ELSEWHERE = 0.97  # of its gain: friction is where the movement is that it follows
 _CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
@@ -158,15 +164,48 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     if found is None:  # the rows are too few for all of these
         states = [i for i in doubted if i < len(fit.problem.motion.states)]
         return None if len(states) == len(doubted) else _missing_in(fit, states)
+    share = found.terms[0].share if found.terms else 0.0
+    inputs = _shared_inputs(fit) if share < _CERTAIN else ()
+    if inputs:  # what acts as one of these is in several equations at once
+        found = _better(found, _missing_in(fit, inputs))
     if not others or (found.terms and found.terms[0].share > _ENOUGH):
         return found
     beyond = _missing_in(fit, others)  # a sensor may bend what it measures
     if beyond is None or not beyond.terms or _is_a_shift(beyond.terms[0], fit.problem.motion):
         return found
+    return _better(found, beyond)
+
+
+def _better(found: MissingTest, other: MissingTest | None) -> MissingTest:
+    """Return the test of terms elsewhere, if the best of these leaves clearly less."""
     left = 1 - (found.terms[0].share if found.terms else 0.0)
-    if 1 - beyond.terms[0].share > _LESS * left:
+    if other is None or not other.terms or 1 - other.terms[0].share > _LESS * left:
         return found
-    return replace(beyond, p=min(2 * beyond.p, 1.0))
+    return replace(other, p=min(2 * other.p, 1.0))
+
+
+def _shared_inputs(fit: MotionEstimate) -> tuple[int, ...]:
+    """Return the inputs that act in several equations, counted behind states and outputs.
+
+    Friction of a joint is a force there, and moves all that hangs on it, as its motor's does.
+    """
+    motion = fit.problem.motion
+    if motion.functions is not None or motion.source is not None:
+        return ()
+    first = len(motion.states) + len(motion.outputs)
+    numbers = range(first, first + len(motion.inputs))
+    return tuple(i for i in numbers if (np.abs(_acting(fit, i)) > 0).any(axis=0).sum() > 1)
+
+
+def _acting(fit: MotionEstimate, number: int) -> Matrix:
+    """Return ∂f/∂u (m, nx) of an input, counted behind states and outputs, at some points."""
+    motion, segmented = fit.problem.motion, fit.segmented
+    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
+    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
+    every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
+    rows = np.concatenate([x[every], u[every]], axis=1)
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(input_slopes(motion, rows, motion.coordinates.physical(c), number))
 
 
 def _is_a_shift(term: MissingTerm, motion: Motion) -> bool:
@@ -184,7 +223,8 @@ def _is_a_shift(term: MissingTerm, motion: Motion) -> bool:
 def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | None:
     """Return the test of terms in some equations, numbered as by `doubted_equations`."""
     motion = fit.problem.motion
-    names = (*motion.names_of_states, *(output.name for output in motion.outputs))
+    nx, ny = len(motion.states), len(motion.outputs)
+    names = (*motion.names_of_states, *(output.name for output in motion.outputs), *motion.inputs)
     rows = int(fit.segmented.observations.sum())
     tried = _Tried(*_variables(motion), _products(motion.visible), _WIDTHS)
     for fewer in ({"products": []}, {"beyond": ()}):
@@ -220,11 +260,14 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     # Over a range that is small beside the level all shapes are nearly straight
     straight = shape == SHAPES.index("linear")
     gains = np.where(np.isfinite(references) & ~straight, _CURVED * gains, gains)
-    own = np.concatenate([_own(tried, motion, equation) for equation in equations])
+    moved = [_moved_by(fit, equation) for equation in equations]
+    own = np.concatenate([_own(tried, one) for one in moved])
     pushes = own * coefficients > 0
     unlikely = (shape == SHAPES.index("jump")) & pushes
     unlikely |= (shape == SHAPES.index("drag")) & (pushes | (own == 0))
     gains = np.where(unlikely, _UNLIKELY * gains, gains)
+    elsewhere = (shape == SHAPES.index("jump")) & (own == 0)
+    gains = np.where(elsewhere, _ELSEWHERE * gains, gains)
     named: list[tuple[int, MissingTerm]] = []
     for j in np.argsort(-gains):
         rivals = gains[simple] if simple[j] else gains  # widths are named beside a simple term
@@ -236,12 +279,14 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
-        if equations[at] >= len(motion.states):
+        if nx <= equations[at] < nx + ny:
             term = replace(term, equation=None, output=term.equation)
         elif not term.factors and term.variable is not None:
             row = tried.choice[tried.names.index(term.variable)]
-            against = _acts_against(fit, equations[at], row, term.coefficient)
+            against = _acts_against(fit, moved[at], row, term.coefficient)
             term = replace(term, against=against)
+        if equations[at] >= nx + ny:
+            term = replace(term, equation=None, beside=term.equation)
         if not any(term.curves_like(other) for _, other in named):
             named.append((at, term))
     listed = [term for _, term in named]
@@ -254,28 +299,40 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     return MissingTest(p, freedom, share, tuple(listed))
 
 
-def _own(tried: _Tried, motion: Motion, equation: int) -> Vector:
-    """Return how the variable of each term follows the equation's state; 0 where it does not."""
+def _moved_by(fit: MotionEstimate, equation: int) -> Vector:
+    """Return the directions (nx,), by sign, in which a term of an equation moves the states."""
+    motion = fit.problem.motion
+    nx, ny = len(motion.states), len(motion.outputs)
+    if equation >= nx + ny:
+        return np.sign(np.median(_acting(fit, equation), axis=0))
+    return (np.arange(nx) == equation).astype(float)
+
+
+def _own(tried: _Tried, moved: Vector) -> Vector:
+    """Return how the variable of each term follows the states that it moves; 0 where not."""
     found = np.zeros(tried.count)
-    if equation < len(motion.states):
-        found[1 : tried.simple] = np.repeat(tried.choice[:, equation], len(SHAPES))
+    found[1 : tried.simple] = np.repeat(tried.choice[:, : len(moved)] @ moved, len(SHAPES))
     return found
 
 
 def _acts_against(
-    fit: MotionEstimate, equation: int, row: Vector, coefficient: float
+    fit: MotionEstimate, moved: Vector, row: Vector, coefficient: float
 ) -> str | None:
     """Return what an odd term of a variable acts against, as `MissingTerm.against` has it.
 
     Args:
+        moved: directions (nx,) in which the term moves the states.
         row: of the variable (nx + nu,) by states and inputs.
     """
     motion, segmented = fit.problem.motion, fit.segmented
     nx = len(motion.states)
     if row[nx:].any():
         return None
-    if row[equation]:
-        return "movement" if coefficient * row[equation] < 0 else None
+    if (along := float(row[:nx] @ moved)) != 0:
+        return "movement" if coefficient * along < 0 else None
+    if moved.astype(bool).sum() != 1:
+        return None
+    equation = int(np.argmax(np.abs(moved)))
     c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
     x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
     point, inputs, p = x[len(x) // 2], u[len(x) // 2], motion.coordinates.physical(c)
@@ -321,7 +378,12 @@ def _finer(
     *_, gains, shares, coefficients, _ = tested
     j = int(np.argmax(gains))
     made = ("", one.simple + j, float(coefficients[j]), float(shares[j]))
-    best = replace(_term(one, sizes[0], *made), equation=term.equation, output=term.output)
+    best = replace(
+        _term(one, sizes[0], *made),
+        equation=term.equation,
+        output=term.output,
+        beside=term.beside,
+    )
     return best if best.share > term.share else None
 
 

@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, padded_length, quick_jit
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
+from orthaug.physics.motion import Motion
 
 _ROWS = 20_000  # that are looked at, in segments spread over the record
+_STEP = 1e-4  # of an input's largest value, for its slopes
 _NUMBERS = 8_000_000  # that are in memory at most
 
 Terms = Callable[[Float[np.ndarray, "n r"]], Float[np.ndarray, "t r"]]
@@ -68,7 +70,8 @@ def sensitivities(
     """Return the sensitivities along the training segments; None where a value is not finite.
 
     Args:
-        equations: states whose equations the terms are added to, and outputs, counted behind them.
+        equations: states whose equations the terms are added to; outputs, counted behind them; and
+            inputs behind these, as which the terms act then.
         terms: makes the terms, given the points (n, M) of the runs.
         count: of terms.
     """
@@ -95,15 +98,40 @@ def sensitivities(
     to_next, value, to_output = _at_rows(form, numbers, x, u)
     with np.errstate(all="ignore"):
         of_rows = terms(points)
+        ends = _ends(rows, n0, form.motion.hold)
         added, at_ends = (
             of_rows(one.reshape(-1, rows.shape[2]).T).reshape(count, *scored.shape)
-            for one in (rows, _ends(rows, n0, form.motion.hold))
+            for one in (rows, ends)
         )
-        columns = _propagate(to_next, to_output, added, at_ends, equations, form)
+        p = form.motion.coordinates.physical(np.asarray(numbers.c))
+        acting = [
+            tuple(input_slopes(form.motion, one, p, i) for one in (rows, ends))
+            if i >= n0 + target.shape[2]
+            else None
+            for i in equations
+        ]
+        columns = _propagate(to_next, to_output, added, at_ends, equations, acting, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():
         return None
     return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
+
+
+def input_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matrix:
+    """Return ∂f/∂u (…, nx) by an input of the physics at states and inputs (…, nx + nu).
+
+    Args:
+        number: of the input, counted behind states and outputs.
+    """
+    nx, at = len(motion.states), number - len(motion.outputs)
+    flat = rows.reshape(-1, rows.shape[-1]).T
+    step = _STEP * max(float(np.abs(flat[at]).max(initial=0.0)), 1e-12)
+    moved = np.zeros((len(flat), 1))
+    moved[at] = step
+    there, back = (
+        np.asarray(motion.rates(*np.split(flat + sign * moved, [nx]), p, np)) for sign in (1, -1)
+    )
+    return ((there - back) / (2 * step)).T.reshape(*rows.shape[:-1], nx)
 
 
 def _ends(rows: Matrix, n0: int, hold: str) -> Matrix:
@@ -142,11 +170,15 @@ def _propagate(
     added: Any,
     at_ends: Any,
     equations: Sequence[int],
+    acting: Sequence[tuple[Matrix, ...] | None],
     form: MotionDynamics,
 ) -> Any:
     """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next.
 
     The terms act by the trapezoidal rule: `added` at the begin of a sample, `at_ends` at its end.
+
+    Args:
+        acting: for an input, its slopes (m, T, n0) there.
     """
     m, steps, n0, own = to_next.shape
     q, h = len(added), form.sampling_time
@@ -158,13 +190,21 @@ def _propagate(
         columns[:, k] = c @ slope
         columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
         for place, i in enumerate(equations):
-            if i >= n0:
+            if i >= n0 and acting[place] is None:
                 columns[:, k, i - n0, own + place * q : own + (place + 1) * q] = added[:, :, k].T
         slope = a @ slope
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
         now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
         for place, i in enumerate(equations):
-            to = slice(own + place * q, own + (place + 1) * q)
+            to, by = slice(own + place * q, own + (place + 1) * q), acting[place]
+            if by is not None:
+                begin, end = (one[:, k, :, None] for one in by)  # (m, n0, 1)
+                if form.motion.scheme.discrete:
+                    slope[:, :, to] += begin * now[:, None]
+                    continue
+                slope[:, :, to] += h / 2 * (a @ begin) * now[:, None]
+                slope[:, :, to] += h / 2 * end * then[:, None]
+                continue
             if i >= n0:
                 continue
             if form.motion.scheme.discrete:

@@ -524,14 +524,13 @@ def _name_terms(lacks: MissingTest) -> str:
         text = f"Most likely {text}"
     if others:
         text += (
-            ", as would "
-            f"{' or '.join(f'{term.expression} in {_that(term)}' for term in others[:2])}"
+            f", as would {' or '.join(f'{term.expression} {_that(term)}' for term in others[:2])}"
         )
     return f"{text}."
 
 
 def _that(term: MissingTerm) -> str:
-    return term.place.replace("the equation", "that", 1)
+    return term.where.replace("the equation", "that", 1)
 
 
 def colour_sentence(fit: MotionEstimate) -> str:

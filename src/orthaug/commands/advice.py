@@ -122,7 +122,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
         return
     for term in test.terms[:_TERMS]:
         words = "a constant" if term.variable is None else ""
-        place = term.equation or term.output
+        place = term.equation or term.output or term.beside
         yield from _term(job, term.term, place, term.coefficient, words)
 
 
@@ -245,6 +245,8 @@ def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Pro
     if result.residuals.verdict != "unmodelled" or best.variable is None:
         return
     if job.spec.declared_learner() is None:
+        if best.beside is not None:  # of several equations that have the input
+            return
         if best.equation is None:
             own = declared_output(job, str(best.output))
             learned = {f"motion.outputs.{best.output}": own | {"learned": True}}

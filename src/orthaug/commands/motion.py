@@ -99,7 +99,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     ) -> tuple[dict[str, Any], str] | None:
         """Return the change of a spec that adds a term of an equation, and where that is, in words.
 
-        None where the equation has the term already.
+        A term of an input acts as that does, wherever it is. None where the equation has the term
+        already.
         """
         from orthaug.physics.suspected_motion import equations_of, usual_places
 
@@ -119,6 +120,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
                 f"motion.parameters.{name}": {"initial": initial},
             }
             return change, f"in the equation of the output {place}"
+        if place in motion.inputs:
+            return self._beside_input(job, str(place), name, expression, initial)
         if place not in motion.names_of_states:
             return None
         key = motion.equation_key
@@ -130,6 +133,29 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.parameters.{name}": {"initial": initial},
         }
         return change, f"in the equation of {place}"
+
+    def _beside_input(
+        self, job: Job, place: str, name: str, expression: str, initial: float
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change that adds a term to an input in the equations and definitions."""
+        key, declared = self.motion.equation_key, job.declaration["motion"]
+        word = re.compile(rf"\b{re.escape(place)}\b")
+        texts = {
+            f"motion.states.{state}.{key}": str(entry[key])
+            for state, entry in declared["states"].items()
+        }
+        texts |= {
+            f"motion.define.{defined}": str(text)
+            for defined, text in declared.get("define", {}).items()
+        }
+        added = f"({place} + {name}*({expression}))"
+        change: dict[str, Any] = {
+            path: word.sub(lambda _: added, text)
+            for path, text in texts.items()
+            if word.search(text)
+        }
+        change[f"motion.parameters.{name}"] = {"initial": initial}
+        return change, f"beside the input {place}"
 
     def with_lag(
         self, job: Job, late: LateInputResult, name: str

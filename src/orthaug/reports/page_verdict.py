@@ -491,7 +491,7 @@ def _predicted_change(result: FitResult) -> str | None:
         result.residuals.missing.terms if result.residuals and result.residuals.missing else []
     )
     if missing and result.residuals is not None and result.residuals.verdict == "unmodelled":
-        return f"the term {missing[0].expression} in {missing[0].place}"
+        return f"the term {missing[0].expression} {missing[0].where}"
     if cause is not None and (cause.share or 0.0) > _NAMED:
         return _cause_option(cause, result.learns)
     tried = result.validation is not None and _code(result) != "helps"
