@@ -653,3 +653,43 @@ def test_two_inputs_that_are_exchanged_are_named(exchanged, learner):
     found = {one.code: one.text for one in fit.diagnose(blocks=0).warnings}
     assert ("exchanged_inputs" in found) == exchanged
     assert not exchanged or found["exchanged_inputs"].startswith("u and w may be exchanged")
+
+
+def heated(u: np.ndarray, noise: float = 0.01) -> np.ndarray:
+    """A body's temperature under a heater and ambient air, both (N, 2), in steps of 1 s."""
+    rng, x, y = np.random.default_rng(6), 2.0, []
+    for power, air in u:
+        y.append(x)
+        x += 0.15 * power - 0.05 * (x - air)
+    return np.array(y) + noise * rng.normal(size=len(y))
+
+
+@pytest.mark.parametrize(
+    ("read", "code", "said"),
+    [
+        ([[-1, 0], [0, 1]], "reversed_input", "heat may have the other sign: so read, physics"),
+        ([[0, 1], [1, 0]], "exchanged_inputs", "heat and air may be exchanged: so read, physics"),
+        ([[1, 0], [0, 1]], None, ""),
+    ],
+)
+def test_inputs_of_a_motion_that_are_misread_are_named(read, code, said):
+    rng = np.random.default_rng(2)
+    u = np.column_stack(
+        [np.repeat(rng.uniform(0, 6, 25), 16), np.repeat(rng.uniform(0, 4, 10), 40)]
+    )
+    record = oa.Record.from_arrays(
+        u @ np.array(read), heated(u), sampling_time=1.0, inputs=["heat", "air"], outputs=["y"]
+    )
+    parameters = [oa.PhysicalParameter("b", 0.1, min=0), oa.PhysicalParameter("k", 0.1, min=0)]
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "b*heat - k*(x - air)", "y")],
+        [oa.Output("y", "x")],
+        parameters,
+        ["heat", "air"],
+    )
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    texts = {w.code: w.text for w in found.warnings}
+    assert code is None or texts[code].startswith(said)
+    assert {"reversed_input", "exchanged_inputs"} & texts.keys() == ({code} if code else set())
+    if code == "reversed_input":
+        assert "Most likely heat has the other sign" in found.residuals.text

@@ -18,6 +18,7 @@ import inspect
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, NamedTuple
@@ -111,7 +112,6 @@ def _name_of(value: Any) -> str:
 def _code() -> bytes:
     """Return a digest of this package's code, and of JAX and its settings."""
     import jax
-    import jaxlib
     import numpy as np
 
     found = hashlib.sha256()
@@ -120,7 +120,7 @@ def _code() -> bytes:
         found.update(str(path.relative_to(root)).encode() + b"\0")
         found.update(hashlib.sha256(path.read_bytes()).digest())
     settings = [(name, str(getattr(jax.config, name, None))) for name in _SETTINGS]
-    found.update(repr((jax.__version__, jaxlib.__version__, np.__version__, settings)).encode())
+    found.update(repr((jax.__version__, version("jaxlib"), np.__version__, settings)).encode())
     return found.digest()
 
 

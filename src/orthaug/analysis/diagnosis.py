@@ -25,7 +25,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
-from orthaug.analysis.exchanged_inputs import exchanged_inputs
+from orthaug.analysis.exchanged_inputs import exchanged_inputs, misread_inputs
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.predictability import Predictable, from_lags, from_own_past, predictable
@@ -56,6 +56,7 @@ from orthaug.fitting.estimation import estimate
 from orthaug.fitting.inconsistency import inconsistency
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
+from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal
 from orthaug.inference.covariance import by_experiment
@@ -200,15 +201,22 @@ def _of_motion(
         white, explained = True, False
     size = rms_errors(free_run) / fit.problem.deviation
     looked = motion.inputs and motion.source is None  # physics of a file takes minutes for that
-    late = (
-        _late_inputs(fit) if looked and (explained or not white) and np.any(size > _SIZABLE) else ()
-    )
-    verdict = "unmodelled" if explained or late else "white" if white else "equation_noise"
+    late: tuple[LateInput, ...] = ()
+    misread: tuple[Warning, ...] = ()
+    if looked and (explained or not white) and np.any(size > _SIZABLE):
+        task, solver = _physics_alone(fit)
+        misread = misread_inputs(task, solver)
+        late = () if misread else find_late_inputs(task, solver)
+    explained = explained or bool(late or misread)
+    verdict = "unmodelled" if explained else "white" if white else "equation_noise"
     text = free_run_words(
         verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse, slight
     )
+    if misread:
+        sure = misread[0].text.replace(" may have ", " has ").replace(" may be ", " are ")
+        text = f"{text.partition(' Most likely')[0]} Most likely {sure}"
     warnings = [restarted[1]] if restarted else []
-    warnings += [one.warning for one in late]
+    warnings += [*misread, *(one.warning for one in late)]
     warnings += [coarse.warning] if coarse and coarse.warning else []
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
@@ -221,15 +229,15 @@ def _of_motion(
     return Diagnosis(*found, late=late, steps=coarse.steps if coarse else None)
 
 
-def _late_inputs(fit: MotionEstimate) -> tuple[LateInput, ...]:
-    """Return the inputs that act later, by the physics trained before the learner.
+def _physics_alone(fit: MotionEstimate) -> tuple[MotionTask, LevenbergMarquardt]:
+    """Return the physics trained before the learner on the longest experiment, and by what.
 
     It runs in the same compiled programs.
     """
     solver, posed = LevenbergMarquardt().within_limit, fit.problem
     posed = posed if fit.learns else posed.without_learner()
     learner = fit.model.form.bound.learner
-    return find_late_inputs(on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver)
+    return on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver
 
 
 def _predictable(

@@ -40,6 +40,14 @@ _MOSTLY = 0.5  # of the error, which a simple term explains: memory is then judg
 _LITTLE_BESIDE = 0.5  # of that share, which memory must predict
 _LEFT = 0.05  # of the residual's variance, that functions of the regressors predict
 _ONLY = "The 95 % intervals count noise only. "
+_SEARCH = (
+    "Search for its terms with `[[suspects]]` or `orthaug explain`. Write them into the physics, "
+    "or let the learner see what they depend on."
+)
+_LEARN = (
+    "Fit with a learner that sees what the missing terms may depend on; `orthaug explain` then "
+    "names them."
+)
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
 _UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
 _DETERMINED = re.compile(
@@ -192,13 +200,7 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
             "own past predicts"
         )
-    remedy = (
-        "Search for its terms with `[[suspects]]` or `orthaug explain`. Write them into the "
-        "physics, or let the learner see what they depend on."
-        if fit.learns
-        else "Fit with a learner that sees what the missing terms may depend on; `orthaug explain` "
-        "then names them."
-    )
+    remedy = _SEARCH if fit.learns else _LEARN
     moved = (
         "The 95 % intervals count noise only; missing physics may have moved the parameters by "
         "more."
@@ -211,21 +213,33 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
 def _term_of(result: Findings, family: FamilyTest) -> str:
     """Return the missing term that a function of one variable is, in brackets; or nothing."""
     missing = result.residuals.missing if result.residuals is not None else None
-    if missing is None or not missing.terms or missing.p > _SURE_TERM:
+    if missing is None or not missing.terms or (missing.p or 0.0) > _SURE_TERM:
         return ""
     best = missing.terms[0]
     same = (best.equation, best.variable) == (family.equation, family.on)
     return f" ({best.expression}, most likely)" if same else ""
 
 
-def with_found_change(fit: Any, result: Findings, found: str) -> list[Warning]:
+def with_found_change(
+    fit: Any, result: Findings, found: str, *, nearly_all: bool = False
+) -> list[Warning]:
     """Return the warnings after a change of the spec that lowers the error to less than a half.
 
-    One that took what is left for a disturbance refers to the change instead.
+    One that took what is left for a disturbance refers to the change instead. Where the change
+    explains nearly all, it is the remedy, and no state is missing.
 
     Args:
         found: the change and its gain, as a sentence.
     """
+    if nearly_all:
+        done = f"{found} Make that change, and fit again."
+        others = [one for one in result.warnings if one.code != "hidden_state"]
+        return [
+            Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
+            if one.code == "unexplained"
+            else one
+            for one in others
+        ]
     left = _static_share(result)
     if left > _LEFT or result.unexplained is not None or not _is_disturbance(fit, result):
         return list(result.warnings)

@@ -1,19 +1,33 @@
-"""Two inputs that are read from each other's columns: physics alone with the columns exchanged."""
+"""Inputs that are read wrongly: two from each other's columns, or one with the other sign.
+
+Physics alone is refitted with the inputs exchanged or reversed. The coefficients of lagged physics
+take a sign; parameters of a motion that are positive by their bounds do not.
+"""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from orthaug._base.errors import Warning
+from orthaug._base.checks import Matrix
+from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.input_timing import residual_of
+from orthaug.data.record import Record
 from orthaug.data.regressors import lag_rows
+from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.segmented_motion import SegmentedMotion
+from orthaug.models.learners import nothing_learned
 from orthaug.physics.problem import Problem
 
 _CLEARLY = 0.5  # of the error one step ahead: exchanged columns leave less
 _MOST_INPUTS = 5
 _MOST_ROWS = 20_000
+_FAR = 0.5  # of the outputs' deviation: physics alone that leaves less has its inputs right
+_NEAR = 0.3  # of it, which a correction must reach
+_ITERATIONS = 40  # from the initial values: where the wrong inputs led is no place to begin
 
 
 def exchanged_inputs(problem: Problem) -> tuple[Warning, ...]:
@@ -47,8 +61,7 @@ def _left(problem: Problem, order: list[int]) -> float:
 
     In deviations of the outputs; infinite where there is none.
     """
-    moved = tuple(replace(e, inputs=e.inputs[:, order]) for e in problem.record.experiments)
-    x = lag_rows(replace(problem.record, experiments=moved), problem.layout)
+    x = lag_rows(_read_by(problem.record, np.eye(len(order))[order]), problem.layout)
     phi, known = problem.baseline.on(x, problem.layout, problem.outputs)
     if len(phi) != len(problem.rows.y):
         return float("inf")
@@ -60,3 +73,59 @@ def _left(problem: Problem, order: list[int]) -> float:
     columns = columns / np.where(size > 0, size, 1.0)
     left = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
     return float(np.sqrt(np.mean(left**2)))
+
+
+def _read_by(record: Record, read: Matrix) -> Record:
+    """Return a record whose inputs are rows (nu, nu) of products with those of another one."""
+    moved = tuple(replace(e, inputs=e.inputs @ read.T) for e in record.experiments)
+    return replace(record, experiments=moved)
+
+
+def misread_inputs(task: MotionTask, solver: Any) -> tuple[Warning, ...]:
+    """Return a warning where a motion is far better with an input reversed, or two exchanged.
+
+    Args:
+        task: with physics alone trained; what it leaves is set against.
+    """
+    record, free_fit = task.problem.record, task.physics
+    count = len(record.inputs)
+    before = residual_of(task.plan, free_fit)
+    if free_fit is None or not 1 <= count <= _MOST_INPUTS or before < _FAR:
+        return ()
+    found: list[tuple[float, str, str]] = []
+    names = [channel.name for channel in record.inputs]
+    for i, name in enumerate(names):
+        read = np.diag(np.where(np.arange(count) == i, -1.0, 1.0))
+        remedy = "Check its sign convention; `scale` of its channel takes the other sign."
+        found.append((_run_with(task, read, solver), f"{name} may have the other sign", remedy))
+    for a, b in itertools.combinations(range(count), 2):
+        read = np.eye(count)
+        read[[a, b]] = read[[b, a]]
+        remedy = "Check the columns that these inputs are read from."
+        text = f"{names[a]} and {names[b]} may be exchanged"
+        found.append((_run_with(task, read, solver), text, remedy))
+    after, text, remedy = min(found)
+    if not after < min(_NEAR, _CLEARLY * before):
+        return ()
+    code = "reversed_input" if "sign" in text else "exchanged_inputs"
+    said = (
+        f"{text}: so read, physics alone has a free-run error of {after:.3g} instead of "
+        f"{before:.3g} standard deviations of the output. {remedy}"
+    )
+    return (Warning(code, said),)
+
+
+def _run_with(task: MotionTask, read: Matrix, solver: Any) -> float:
+    """Return what physics alone leaves of the free run with inputs read otherwise; inf if none."""
+    plan, problem = task.plan, task.problem
+    assert task.physics is not None
+    try:
+        given = replace(plan.problem, record=_read_by(problem.record, read))
+        segmented = SegmentedMotion.of(given, nothing_learned(), plan.criterion)
+    except InputError:
+        return float("inf")
+    segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps)
+    segmented = segmented.from_states(task.physics.end.point.states)
+    first = problem.motion.coordinates.initial
+    fitted = segmented.descend(segmented.objective(), first, solver.at_most(_ITERATIONS))
+    return residual_of(segmented, fitted if fitted.ending.usable else None)

@@ -62,9 +62,9 @@ class OtherSolution:
             )
             return (Warning("local_minimum", text),)
         text = (
-            f"physics alone explains the data equally well with {values}. The intervals are those "
-            "of the solution next to the initial values; give bounds or better initial values to "
-            "choose one."
+            f"physics alone explains the data equally well with {values}. The result is the "
+            "solution next to the initial values; give bounds or better initial values to choose "
+            "one."
         )
         return (Warning("several_solutions", text),)
 

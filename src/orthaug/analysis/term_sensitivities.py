@@ -128,9 +128,8 @@ def input_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matrix
     step = _STEP * max(float(np.abs(flat[at]).max(initial=0.0)), 1e-12)
     moved = np.zeros((len(flat), 1))
     moved[at] = step
-    there, back = (
-        np.asarray(motion.rates(*np.split(flat + sign * moved, [nx]), p, np)) for sign in (1, -1)
-    )
+    points = (flat + moved, flat - moved)
+    there, back = (np.asarray(motion.rates(one[:nx], one[nx:], p, np)) for one in points)
     return ((there - back) / (2 * step)).T.reshape(*rows.shape[:-1], nx)
 
 

@@ -537,7 +537,8 @@ def colour_sentence(fit: MotionEstimate) -> str:
     """Return a sentence on coloured errors, and on the standard errors that follow."""
     errors = "one step ahead" if fit.model.coloured else "of the free run"
     text = f"the errors {errors} are coloured: judge the model by held-out errors"
-    if fit.std is None or fit.plain_covariance is not None:
+    given = fit.std is not None and bool(np.isfinite(fit.std).any())
+    if not given or fit.plain_covariance is not None:
         return f"{text}."
     return (
         f"{text}. The rows are too few for robust standard errors: those given assume white errors "

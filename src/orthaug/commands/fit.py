@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from orthaug.reports.page_fit import Origin
 
 _HALF = 0.5  # of the error, to less than which a change of the spec lowers it: it explains most
+_FIFTH = 0.2  # of it: the change explains nearly all
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,17 +82,18 @@ def with_advice(fitted: FitReport) -> FitReport:
     )
     advice, tried = ([], None) if found is None else found
     known = fitted.result.warnings
-    if advice and _explains_most(advice[0]):
-        known = with_found_change(fitted.fit, fitted.result, advice[0].text)
+    if advice and _explains_more_than(_HALF, advice[0]):
+        nearly_all = _explains_more_than(_FIFTH, advice[0])
+        known = with_found_change(fitted.fit, fitted.result, advice[0].text, nearly_all=nearly_all)
     trials = {"warnings": [*known, *failed], "advice": advice, "advice_trials": tried}
     return replace(fitted, result=fitted.result.changed(**trials))
 
 
-def _explains_most(advice: AdviceResult) -> bool:
-    """Return whether a change lowers the error to less than a half, or keeps a run bounded."""
+def _explains_more_than(left: float, advice: AdviceResult) -> bool:
+    """Return whether a change lowers the error to less than a share, or keeps a run bounded."""
     if advice.after is None:
         return False
-    return advice.before is None or advice.after < _HALF * advice.before
+    return advice.before is None or advice.after < left * advice.before
 
 
 def keep_states(job: Job, folder: Path, *, resume: bool = False) -> Job:
