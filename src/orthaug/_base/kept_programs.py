@@ -13,10 +13,10 @@ import dataclasses
 import enum
 import functools
 import hashlib
-import importlib
 import inspect
 import json
 import struct
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -162,9 +162,9 @@ def rebuilt(description: Any, arrays: Sequence[Any]) -> Any:
         return arrays[description]
     if "named" in description:
         module, _, name = description["named"].partition(":")
-        if not module.startswith("orthaug."):
+        kind: Any = sys.modules.get(module) if module.startswith("orthaug.") else None
+        if kind is None:
             raise NotKept(module)
-        kind: Any = importlib.import_module(module)
         for part in name.split("."):
             kind = getattr(kind, part)
         if not (isinstance(kind, type) and issubclass(kind, tuple)):
