@@ -375,10 +375,9 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
     }
     caption = (
         "Bias of each parameter (columns) by each term that may be missing from the physics "
-        "(rows), in per cent of its value. A term without a guessed size counts as 1 % of the "
-        "output. Colours are logarithmic."
+        "(rows), in per cent of its value."
     )
-    caption += f" {shown.left_out}" if shown.left_out else ""
+    caption = " ".join([caption, *shown.sizes, "Colours are logarithmic.", shown.left_out]).strip()
     height = 90 + 28 * len(shown.suspects)
     return Plot("Bias of each parameter by each suspected term.", caption, [heat], layout, height)
 

@@ -375,8 +375,8 @@ def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> 
     if bias:
         text("What would bias the parameters", "h3")
         hint = (
-            "The bias if such a term is missing from the physics, with the size that the spec "
-            "gives, or 1 % of the output's."
+            "The bias if such a term is missing from the physics. Its size is that of the spec, "
+            "or else its RMS is 1 % of the output's standard deviation."
         )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
