@@ -498,6 +498,48 @@ def test_curves_of_the_loss_are_named_by_start_or_by_structure():
 
 
 @served
+def test_a_run_that_begins_again_breaks_its_curve_of_the_loss():
+    from orthaug.commands.app.widgets import loss_figure
+
+    run = Run(1, "orthogonal", 1, "none")
+    figure = loss_figure([(run, 1, 4.0), (run, 9, 1.0), (run, 1, 0.5), (run, 2, 0.4)])
+    (trace,) = figure["data"]
+    assert trace["x"] == [1, 9, None, 1, 2] and trace["y"] == [4.0, 1.0, None, 0.5, 0.4]
+
+
+@served
+def test_a_table_of_parameters_has_the_interval_with_the_bias(monkeypatch):
+    from orthaug.commands.app import view_training
+    from orthaug.commands.app.widgets import interval_figure
+
+    shown = []
+    monkeypatch.setattr(view_training, "table", lambda *given: shown.append(given))
+    row = {"name": "c", "value": 4.5, "std": 0.01, "ci95": [4.4, 4.6], "unit": "N s/m"}
+    bias = {"value": 2.5, "determined": True}
+    biased = row | {"bias": bias, "ci95_with_bias": [0.9, 2.3]}
+    lost = row | {"bias": bias | {"determined": False}, "ci95_with_bias": None}
+    view_training._parameters("Parameters", [("", [biased, lost])], {})
+    ((head, (first, second), _),) = shown
+    assert head[4:6] == ("bias", "95 % interval with the bias")
+    assert first[3:6] == ("4.4 … 4.6", "2.5", "0.9 … 2.3")
+    assert second[5] == "not determined by these data"
+    view_training._parameters("Parameters", [("", [row])], {})
+    assert "bias" not in shown[1][0]
+    thin, _ = interval_figure([("fit", [biased])], {})["data"]
+    assert thin["x"] == [0.9, 2.3] and thin["name"] == "95 % interval with the bias"
+
+
+@served
+def test_the_form_shows_the_focus_that_training_takes():
+    from orthaug.commands.app.view_model import _FOCUS, _focus_of
+
+    cases = (({}, False), ({"horizon": 3}, False), ({}, True), ({"focus": "prediction"}, True))
+    found = [_focus_of(training, moves=moves) for training, moves in cases]
+    assert found == ["auto", "prediction", "simulation", "prediction"]
+    assert _FOCUS["auto"] == "automatic"
+
+
+@served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
     session = Session("key", tmp_path, WorkerPool())
     page, told, seen = routes.Page(session), [], []

@@ -887,7 +887,7 @@ ARGUMENTS = [
     (["fit", "absent.toml"], ["absent.toml", "no such file"]),
     (["check", "absent.toml"], ["absent.toml", "no such file"]),
     (["fit", "."], ["not a file"]),
-    (["fit", "run.csv"], ["run.csv", "broken TOML"]),
+    (["fit", "run.csv"], ["run.csv: found a data file", "`orthaug init run.csv` writes"]),
     (["fit", "plant.toml", "--outt", "x"], ["No such option", "--outt"]),
     (["fit", "plant.toml", "more"], ["unexpected extra argument", "more"]),
     (["fit", "plant.toml", "--out"], ["--out", "requires an argument"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from test_cli import one_line, run, write_csv
 
 import orthaug as oa
 from orthaug import InputError, Output, State
+from orthaug._base.lines import narrow_screen
+from orthaug.analysis.findings import MemoryResult
 from orthaug.data.expressions import parse_named
+from orthaug.reports.explanation import ExplainResult, explain_text
 from orthaug.selection.explaining import _expression_text, candidates_of
-from orthaug.selection.explanation import NewTerm, added_to_motion
+from orthaug.selection.explanation import NewTerm, SingleTerm, added_to_motion
 from orthaug.selection.learned_linearization import (
     MotionResponse,
     _move_parameters,
@@ -439,3 +443,34 @@ def test_an_end_stop_or_a_limit_of_a_spring_leaves_it_its_stiffness(slope):
     found = oa.explain(fit, record)
     assert found.terms[0].kind == "dead_zone"
     assert found.parameters[0].value_with == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_narrow_table_keeps_a_share_with_its_term():
+    long = "a bristle of LuGre friction of position[k-1] and of angle, width 0.0056"
+    wide = "position[k-1]*position[k-2] + position[k-1]*position[k-3] + angle"
+    memory = MemoryResult(
+        name=long, kind="lugre", on="x", scale=1.0, equation="position", share=0.574, p=0.0
+    )
+    single = SingleTerm("sum", wide, "position", 0.9)
+    other = replace(single, added_to="angle")
+    found = ExplainResult(
+        found=False,
+        share=0.0,
+        noise=None,
+        p=None,
+        points=100,
+        terms=[],
+        singles=[single, other],
+        parameters=[],
+        spec=None,
+        text="nothing.",
+        memory=[memory],
+        warnings=[],
+    )
+    with narrow_screen(80):
+        lines = explain_text(found).splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line for line in lines if line[:4] in ("57.4", "90 %")]
+    begins = ("90 %   position  position[k-1]*", "90 %   angle     position[k-1]*")
+    assert [any(row.startswith(begin) for row in rows) for begin in begins] == [True, True]
+    assert rows[-1].startswith("57.4 %  position  a bristle of LuGre friction") and len(rows) == 3

@@ -759,6 +759,13 @@ def test_models_without_code_are_refused_in_words(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_exchanged_folder_and_target_are_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(oa.InputError, match=r"write `export\(model, 'plant', 'c'\)`"):
+        oa.export(case("network").model, "c", "plant")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture
 def saved(tmp_path, monkeypatch) -> Path:
     oa.save(case("network").model, tmp_path / "out" / "model")

@@ -70,6 +70,19 @@ def test_a_cell_has_no_sign_of_zero_and_says_that_there_is_no_bias():
     assert bias_map([suspect("drag", {"a": None})]).reach > 0
 
 
+def test_a_bias_without_a_guess_has_the_sign_and_the_size_of_what_the_learner_found():
+    found = suspect("tanh(v)", {"c": -14.0, "m": 0.0}).model_copy(
+        update={"coefficient": None, "size": 0.05, "coefficient_found": -4.0, "explained": 0.99}
+    )
+    assert found.percent == pytest.approx({"c": 2.8, "m": 0.0})  # 56 % are 20 times as much
+    assert found.model_copy(update={"coefficient_found": None}).percent["c"] == pytest.approx(-2.8)
+    for text in (bias_plot([found]).caption, bias_figure([found]).get_suptitle()):
+        assert "whose RMS is 1 % of the output's standard deviation" in text
+        assert "The learner found tanh(v) 20 times as large, and so is its bias." in text
+    guessed = bias_plot([suspect("drag", {"c": 1.0})]).caption
+    assert "RMS" not in guessed and "The learner found" not in guessed
+
+
 def analysed(e: np.ndarray, x: dict[str, np.ndarray]) -> ResidualTestResult:
     columns = np.stack(list(x.values()), axis=1)
     (found,) = analyse([e[:, None]], [columns], [columns], ["speed"], list(x), list(x))

@@ -8,6 +8,7 @@ import naive
 import numpy as np
 import pytest
 
+import orthaug as oa
 from orthaug import (
     MLP,
     Baseline,
@@ -436,3 +437,31 @@ def test_initial_refused(pair, initial, message):
     model, record = pair
     with pytest.raises(InputError, match=message):
         model.simulate(record, initial)
+
+
+def test_functions_of_a_model_take_a_fit(tmp_path):
+    record = one_signal(np.random.default_rng(5), 80)
+    fit = estimate(record, Baseline.from_terms(ONE, {"gain": 1.0}), learner=None)
+    oa.save(fit, tmp_path / "model")
+    assert oa.load(tmp_path / "model").parameters == fit.model.parameters
+    assert oa.export(fit, tmp_path / "code", "c") is not None
+    assert oa.numpy_step(fit).step_inputs == ("u",)
+    assert oa.stability(fit, record).text == oa.stability(fit.model, record).text
+    np.testing.assert_array_equal(
+        oa.prediction_std(fit, record)[0], oa.prediction_std(fit.model, record)[0]
+    )
+
+
+def test_what_has_no_model_is_refused_in_one_line(tmp_path):
+    record = one_signal(np.random.default_rng(5), 30)
+    calls = (
+        lambda: oa.save(record, tmp_path / "model"),
+        lambda: oa.export(record, tmp_path / "code", "c"),
+        lambda: oa.numpy_step(record),
+        lambda: oa.stability(record, record),
+        lambda: oa.prediction_std(record, record),
+    )
+    for call in calls:
+        with pytest.raises(InputError, match="`model` must be a fitted model, or what estimate"):
+            call()
+    assert list(tmp_path.iterdir()) == []

@@ -131,7 +131,7 @@ def test_the_keys_of_a_learner_from_outside_are_checked(project):
         for key, words in (
             ("highest = 1", "'learner.highest': found 1; expected greater than or equal to 2"),
             ("highest = 2.5", "'learner.highest': found 2.5; expected an integer"),
-            ("centre = 3", "'learner.centre': found 3; expected a list"),
+            ("centre = 3", "'learner.centre': found 3; expected a list, such as centre = [3]"),
             ("centre = [nan]", "'learner.centre[0]': found nan; expected a finite number"),
             ("highes = 3", "unknown key 'learner.highes', did you mean 'highest'?"),
         ):

@@ -21,6 +21,7 @@ import orthaug as oa
 from orthaug import Channel, Response, Trajectory
 from orthaug._base.errors import Warning
 from orthaug.analysis.findings import BiasResult
+from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.commands.compare import compare_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
@@ -28,6 +29,7 @@ from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_compare import ComparePage, compare_sections
+from orthaug.reports.page_figures import interval_plot
 from orthaug.reports.page_fit import FitPage, fit_sections
 from orthaug.reports.page_runs import (
     Run,
@@ -347,6 +349,24 @@ def test_intervals_and_shares_in_cells():
     )
 
 
+def test_the_interval_with_the_bias_has_one_name():
+    bias = BiasResult(value=2.5, cause="friction", share=1.0, determined=True)
+    row = ParameterResult(name="c", unit="", initial=3.0, value=4.5, std=0.1, ci95=[4.3, 4.7])
+    row = row.model_copy(update={"bias": bias, "ci95_with_bias": [0.9, 2.3]})
+    drawn = interval_plot([row])
+    assert drawn is not None and "95 % interval with the bias" in drawn.caption
+    (legend,) = (t["name"] for t in drawn.traces if t.get("x") == [0.9, 2.3])
+    assert legend == "95 % interval with the bias"
+
+
+def test_the_axis_of_the_share_of_the_learner_says_where_it_ends(pages):
+    (drawn,) = (f for f in figures(pages["lagged"]) if f["data"][0].get("type") == "bar"
+                and "share of the learner" in f["layout"]["xaxis"]["title"]["text"])  # fmt: skip
+    end = drawn["layout"]["xaxis"]["range"][1]
+    title = f"share of the learner [%]; the axis ends at {percent(end / 100)}"
+    assert drawn["layout"]["xaxis"]["title"]["text"] == title and 0 < end <= 100
+
+
 def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Response:
     """A response of one output over some experiments, the last of which may run away."""
     found = []
@@ -481,6 +501,10 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     one = lagged.result.model_copy(update={"parameters": [biased]})
     share = percent(10 * (row.std or 1.0) / (row.value or 1.0), signed=True)
     assert f"a is biased by about {share}, 10 times its standard error" in fit_verdict(one).trust
+    bias["value"] = 1500 * (row.std or 1.0)
+    biased = row.model_copy(update={"bias": type("B", (), bias)()})
+    many = lagged.result.model_copy(update={"parameters": [biased]})
+    assert ", 1500 times its standard error" in fit_verdict(many).trust
     for name in ("unmodelled", "sensor_noise"):
         residuals = motion.result.residuals.model_copy(
             update={"verdict": name, "changes": [], "missing": None}

@@ -258,3 +258,34 @@ def test_on_paper_every_plot_is_whole(browser, folder):
             and 3 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", paper)) <= 20
         )
         assert min(page.evaluate(widths)) > 0 and max(page.evaluate(widths)) > max(seen)
+
+
+def _light(rgb: np.ndarray) -> float:
+    """The relative luminance of a colour of three parts from 0 to 1, as WCAG defines it."""
+    part = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return float(part @ [0.2126, 0.7152, 0.0722])
+
+
+def _colour(text: str) -> np.ndarray:
+    return np.array([int(text[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_numbers_in_the_cells_of_a_map_can_be_read(browser, folder, scheme):
+    with Shown(browser, folder / "fit.html", scheme=scheme) as page:
+        (map_,) = page.evaluate(
+            "[...document.querySelectorAll('.plot')].filter(p => p.layout.annotations?.length && "
+            "p.data[0].type === 'heatmap').map(p => [p.data[0], p.layout.annotations])"
+        )
+    trace, written = map_
+    scale = [(at, _colour(text)) for at, text in trace["colorscale"]]
+    contrasts = []
+    for cell in written:
+        value = trace["z"][cell["y"]][cell["x"]]
+        assert cell["text"] == trace["text"][cell["y"]][cell["x"]]
+        share = (value - trace["zmin"]) / (trace["zmax"] - trace["zmin"])
+        places, ends = zip(*scale, strict=True)
+        shade = np.array([np.interp(share, places, part) for part in np.transpose(ends)])
+        light = sorted([_light(shade), _light(_colour(cell["font"]["color"]))])
+        contrasts.append((light[1] + 0.05) / (light[0] + 0.05))
+    assert len(contrasts) == np.size(trace["z"]) > 5 and min(contrasts) >= 4.5

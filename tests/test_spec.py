@@ -247,6 +247,20 @@ def test_files_that_are_no_toml(tmp_path, content, message):
     assert re.search(message, refused(tmp_path, content))
 
 
+@pytest.mark.parametrize("content", [b"u,y\n1,2\n", bytes(range(256))])
+def test_a_data_file_in_the_place_of_a_spec_is_named(tmp_path, monkeypatch, content):
+    monkeypatch.chdir(tmp_path)
+    Path("motor.csv").write_bytes(content)
+    with pytest.raises(InputError, match="^motor.csv: found a data file; expected a spec") as error:
+        load_spec(Path("motor.csv"))
+    assert "`orthaug init motor.csv` writes" in str(error.value)
+
+
+def test_no_list_is_suggested_where_its_entry_would_be_wrong(tmp_path):
+    message = refused(tmp_path, FULL.replace("hidden = [16, 8]", "hidden = 16.5"))
+    assert "'learner.hidden': found 16.5; expected a list." in message
+
+
 def test_a_byte_order_mark_is_no_broken_toml(tmp_path):
     """Windows editors write one; data files with it are read too."""
     assert load_spec(put(tmp_path, b"\xef\xbb\xbf" + LEAST.encode())).data.outputs == ["y"]
@@ -397,7 +411,7 @@ VALUES = [  # (changed in FULL), the key, what was found, what is expected
     ("fixed = true", 'fixed = "yes"', "baseline.terms[2].fixed", '"yes"', "boolean"),
     ("g = 9.81", 'g = "9.81 m/s2"', "baseline.constants.g", '"9.81 m/s2"', "number"),
     ('kind = "mlp"', 'kind = "gp"', "learner.kind", '"gp"', "'mlp', 'terms' or 'none'"),
-    ("hidden = [16, 8]", "hidden = 16", "learner.hidden", "16", "list"),
+    ("hidden = [16, 8]", "hidden = 16", "learner.hidden", "16", "a list, such as hidden = [16]"),
     (
         "hidden = [16, 8]",
         "hidden = [16, 0]",

@@ -15,6 +15,7 @@ _screen = [WIDTH]
 _LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
 _LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
 INTERVAL_HEAD = "95 % interval"  # of the column of intervals
+BIASED_INTERVAL = "95 % interval with the bias"  # of one that covers noise and bias
 _GAP = "  "
 _NUMBER = re.compile(r"(?:[-+−<]? ?[\d.]+(?:e[-+]?\d+)?(?: %)?|–|inf|)")  # a cell of figures
 MOST_DIGITS = 15  # of a number in double precision

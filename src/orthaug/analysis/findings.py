@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from pydantic import Field
@@ -89,6 +90,9 @@ class PhysicalBias(Content):
     relative: Number
 
 
+NO_GUESS = 0.01  # of the outputs' standard deviation: a term without a guess of its size
+
+
 class SuspectResult(Content):
     """The change of θ by a term that may be missing."""
 
@@ -121,15 +125,16 @@ class SuspectResult(Content):
     def percent(self) -> dict[str, float | None]:
         """Bias of every θ and physical parameter, in per cent of its value.
 
-        With a guess it is the bias by the guessed coefficient. Without one the term counts as 1 %
-        of the outputs' deviation over the measure.
+        With a guess it is the bias by the guessed coefficient. Without one the RMS of the term
+        counts as `NO_GUESS` of the outputs' standard deviation, with the sign that the learner
+        shows, so that the bias has the sign of a budget's.
         """
         coefficient = self.coefficient
-        if coefficient is None:
-            coefficient = 0.01 / self.size if self.size else None
+        if coefficient is None and self.size:
+            coefficient = math.copysign(NO_GUESS / self.size, self.coefficient_found or 1.0)
         relative = {**(self.relative_bias or {}), **(self.relative_physical_bias or {})}
         shares = {
-            k: None if v is None or coefficient is None else 100 * v * coefficient
+            k: None if v is None or coefficient is None else 100 * v * coefficient + 0.0  # no -0
             for k, v in relative.items()
         }
         exact = {

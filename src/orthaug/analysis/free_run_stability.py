@@ -22,7 +22,7 @@ from orthaug.analysis.contraction import Contraction, contraction
 from orthaug.analysis.feedback import Feedback, feedback
 from orthaug.analysis.lipschitz import Lipschitz, lipschitz
 from orthaug.data.record import Record
-from orthaug.models.model import Model
+from orthaug.models.model import HoldsModel, Model, model_of
 from orthaug.models.response import Response
 
 
@@ -48,7 +48,7 @@ class Stability:
 
 
 def stability(
-    model: Model,
+    model: Model | HoldsModel,
     record: Record,
     *,
     response: Response | None = None,
@@ -59,13 +59,15 @@ def stability(
     """Return all checks of a model on a record, with a text that says what they mean.
 
     Args:
+        model: a lagged model; of a fit its model.
+        record: measured data.
         response: the model's free run of the record, if it is there already.
         x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
             already.
         box, largest: as in `contraction` and `divergence_scaling`.
 
     Raises:
-        InputError: as the single checks.
+        InputError: no model; as the single checks.
 
     Examples:
         >>> import orthaug as oa
@@ -77,6 +79,7 @@ def stability(
         >>> print(found.diverges_at, round(found.contraction.rate, 6))
         None 0.5
     """
+    model = model_of(model)
     gradients, run = lipschitz(model, record, x=x), feedback(model, record, response=response)
     contracts = contraction(model, record, box=box, along=run)
     factor = divergence_scaling(model, record, largest)

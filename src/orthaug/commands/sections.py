@@ -13,7 +13,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar, Union
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    create_model,
+    model_validator,
+)
 
 from orthaug._base.checks import nearest
 from orthaug._base.errors import KeyedError, shorten
@@ -164,7 +172,23 @@ def first_message(error: ValidationError, content: dict[str, Any], model: type[B
         return f"'{key}': {text}" if key else text
     same_key = [e["msg"] for e in errors if _key(e["loc"], content) == key]
     expected = " or ".join(dict.fromkeys(_plain(m) for m in same_key))
-    return f"'{key}': found {_file_text(given)}; expected {expected}"
+    example = _list_example(first, model) if expected == "a list" else ""
+    return f"'{key}': found {_file_text(given)}; expected {expected}{example}"
+
+
+def _list_example(error: Any, model: type[BaseModel]) -> str:
+    """Return `, such as hidden = [6]` for 6; nothing where a list of the value is wrong too."""
+    *parents, name = [part for part in error["loc"] if isinstance(part, str | int)]
+    section = _section_at(parents, model)
+    field = section.model_fields.get(str(name)) if section is not None else None
+    if field is None or isinstance(error["input"], dict):
+        return ""
+    kind: Any = field.annotation
+    try:
+        TypeAdapter(kind).validate_python([error["input"]], strict=True)
+    except ValidationError:
+        return ""
+    return f", such as {name} = {_file_text([error['input']])}"
 
 
 def values_by_key(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -221,12 +245,18 @@ def _key(location: tuple[Any, ...], content: Any) -> str:
 
 def _known_keys(parents: list[Any], model: Any) -> list[str]:
     """Return the keys of the section at a path such as ["data", "tests", "steps"]."""
+    section = _section_at(parents, model)
+    return [] if section is None else list(section.model_fields)
+
+
+def _section_at(parents: list[Any], model: Any) -> type[BaseModel] | None:
+    """Return the section at a path; None where there is none."""
     for part in parents:
         if isinstance(part, int) or not isinstance(model, type):
             continue
         field = model.model_fields.get(part)
         model = _section_of(field.annotation) if field else model
-    return list(model.model_fields) if isinstance(model, type) else []
+    return model if isinstance(model, type) else None
 
 
 def _section_of(annotation: Any) -> Any:

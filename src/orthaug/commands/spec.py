@@ -47,7 +47,7 @@ from orthaug.commands.sections import (
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
-from orthaug.data.tables import check_readable
+from orthaug.data.tables import check_readable, is_table
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
 from orthaug.fitting.noise import ARMA, OF_MOTIONS, Innovations, Noise, Order
@@ -584,6 +584,15 @@ def _spec_model(registered: object) -> type[Spec]:
     return create_model("Spec", __base__=Spec, **fields)
 
 
+def _refuse_data(path: Path) -> None:
+    """Raise SpecError for a data file in the place of a spec."""
+    if is_table(path):
+        raise SpecError(
+            f"{path}: found a data file; expected a spec (TOML). `orthaug init {path}` writes a "
+            "first one for these data."
+        )
+
+
 def load_spec(path: Path) -> Spec:
     """Read and check a spec file.
 
@@ -594,8 +603,10 @@ def load_spec(path: Path) -> Spec:
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as error:
+        _refuse_data(path)
         raise SpecError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
     except UnicodeDecodeError:
+        _refuse_data(path)
         raise SpecError(f"{path}: not a text file; expected TOML in UTF-8.") from None
     except RecursionError:
         raise SpecError(f"{path}: broken TOML: tables or lists are nested too deeply.") from None

@@ -149,6 +149,11 @@ def _units_of(header: Sequence[str], units: Sequence[str]) -> dict[str, str]:
     }
 
 
+def is_table(path: Path) -> bool:
+    """Return whether a file has the ending of data files."""
+    return path.suffix.lower() in _READERS
+
+
 def reading_note(path: Path) -> str:
     """Return a note on how a file is read, such as a guessed encoding; mostly empty."""
     return layout(path).note if _READERS.get(path.suffix.lower()) is _read_text else ""

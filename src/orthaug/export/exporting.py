@@ -24,7 +24,7 @@ from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
 from orthaug.export.program import WRITTEN, Program, Signal, Vectors
 from orthaug.models import storage
-from orthaug.models.model import Model
+from orthaug.models.model import HoldsModel, Model, model_of
 
 _LONGEST = 40  # characters of a name, which is put in front of others
 _TAKEN = (
@@ -81,7 +81,7 @@ def check_export(to: str, folder: Path, name: str = "model", *, force: bool = Fa
 
 
 def export(
-    model: Model,
+    model: Model | HoldsModel,
     folder: str | Path,
     to: str,
     *,
@@ -93,7 +93,7 @@ def export(
     Targets of a source, such as fmu-parameters, write estimates, and no program.
 
     Args:
-        model: what to write.
+        model: what to write; of a fit its model.
         folder: a new one, or one that holds an export.
         to: c, casadi, control, fmu, numpy, onnx or latex; of a source fmu-parameters or mjcf.
         name: is put in front of the functions in C, and names the files.
@@ -111,12 +111,13 @@ def export(
         >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
         >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = export(fit.model, Path(folder, "code"), to="c", name="plant")
+        ...     _ = export(fit, Path(folder, "code"), to="c", name="plant")
         ...     sorted(file.name for file in Path(folder, "code").iterdir())
         ['README.md', 'check.c', 'manifest.json', 'plant.c', 'plant.h', 'vectors.csv']
     """
-    check_type(model, Model, "model", "a fitted model")
+    model = model_of(model)
     check_type(folder, str | os.PathLike, "folder", "a folder's name")
+    _check_order(folder, to)
     folder = Path(folder)
     check_export(to, folder, name, force=force)
     if to not in TARGETS:
@@ -143,6 +144,15 @@ def export(
                 content if isinstance(content, bytes) else content.encode("utf-8")
             )
     return program
+
+
+def _check_order(folder: Any, to: Any) -> None:
+    """Raise InputError where the folder and the target are exchanged."""
+    if to not in TARGETS and str(folder) in TARGETS:
+        raise InputError(
+            "the folder comes before the target: write "
+            f"`export(model, {show(to)}, {show(str(folder))})`."
+        )
 
 
 def _readme(program: Program, target: Target, rows: int, *, in_loop: bool) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector, check_type
+from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
@@ -20,7 +20,7 @@ from orthaug.models.beyond import FADED
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import ACTIVATIONS, Bound
-from orthaug.models.model import Model
+from orthaug.models.model import HoldsModel, Model, model_of
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
@@ -103,15 +103,14 @@ _OWN_FUNCTION = (
 )
 
 
-def program_of(model: Model, name: str = "model", digest: str = "") -> Program:
+def program_of(model: Model | HoldsModel, name: str = "model", digest: str = "") -> Program:
     """Return the step of a model in the intermediate form, that of the plant of a loop.
 
     Raises:
         InputError: physics or a learner that is a Python function, an ensemble, a hold that needs
             the whole record.
     """
-    check_type(model, Model, "model", "a fitted model")
-    model = model.plant
+    model = model_of(model).plant
     numbers = model.numbers
     if not all(np.isfinite(np.asarray(values)).all() for values in numbers[:6]):
         raise InputError("the model holds numbers that are not finite; fit it again.")

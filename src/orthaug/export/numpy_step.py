@@ -12,7 +12,7 @@ from orthaug._base.errors import InputError
 from orthaug.export.lowering import program_of
 from orthaug.export.nodes import ACTIVATIONS, SHARED_NAMES, Apply, Entry, Name, Node, Number
 from orthaug.export.program import Block, Program, Scheme
-from orthaug.models.model import Model
+from orthaug.models.model import HoldsModel, Model
 from orthaug.physics.integrators import INTEGRATORS
 
 Values = dict[str, Any]
@@ -129,13 +129,13 @@ class NumpyStep:
         return lambda values: function(first(values), second(values))
 
 
-def numpy_step(model: Model) -> NumpyStep:
+def numpy_step(model: Model | HoldsModel) -> NumpyStep:
     """Return the step of a fitted model in NumPy, for loops in Python.
 
     It is for places where JAX is too slow to call.
 
     Args:
-        model: as `estimate` or `load` gives it; of one in a loop the plant is taken.
+        model: as `load` gives it, or a fit; of one in a loop the plant is taken.
 
     Returns:
         The step: `state, outputs = step(state, inputs)`; `step.state_names` and `step.step_inputs`
@@ -150,7 +150,7 @@ def numpy_step(model: Model) -> NumpyStep:
         >>> y = [0.0, 0.5, 1.25, 0.625, 1.8125, 1.40625]  # 0.5 (y[k-1] + u[k-1])
         >>> record = oa.Record.from_arrays(u=u, y=y)
         >>> physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
-        >>> step = numpy_step(oa.estimate(record, physics, learner=None).model)
+        >>> step = numpy_step(oa.estimate(record, physics, learner=None))
         >>> step.state_names, step.step_inputs
         (('y[k-1]', 'u[k-1]'), ('u',))
         >>> state, outputs = step([4.0, 1.0], [1.0])

@@ -25,7 +25,7 @@ from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
-from orthaug.models.model import Model
+from orthaug.models.model import HoldsModel, Model, model_of
 from orthaug.models.rows import (
     InMemory,
     chunk_shape,
@@ -191,7 +191,7 @@ def joint_covariance(
     return (2.0 if convention == "paper" else 1.0) * half @ (half.T @ middle @ half) @ half.T
 
 
-def prediction_std(model: Model, record: Record) -> list[Matrix]:
+def prediction_std(model: Model | HoldsModel, record: Record) -> list[Matrix]:
     """Return the standard error (N, ny) of one-step predictions on every row of every experiment.
 
     NaN on the first lags.
@@ -202,12 +202,13 @@ def prediction_std(model: Model, record: Record) -> list[Matrix]:
     diag(noise))`.
 
     Args:
-        model: with statistics, as a fit has them.
+        model: with statistics, as a fit has them; of a fit its model.
         record: inputs and outputs, measured.
 
     Raises:
-        InputError: a model without statistics, other channels.
+        InputError: no model, or one without statistics; other channels.
     """
+    model = model_of(model)
     joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(

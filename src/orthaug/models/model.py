@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_count
+from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array
 from orthaug._base.views import NotebookView
 from orthaug.data.record import Channel, Experiment, Preparation, Record
@@ -373,3 +374,26 @@ def _with_physics(run: Trajectory, physics: Matrix) -> Trajectory:
     """
     learner = run.model - physics
     return replace(run, baseline=physics, learner=learner, learner_before=learner, whole=run.model)
+
+
+class HoldsModel(Protocol):
+    """An object with a fitted model, such as an estimate."""
+
+    @property
+    def model(self) -> Model[Any]:
+        """The fitted model."""
+        ...
+
+
+def model_of(given: Model[Any] | HoldsModel) -> Model[Any]:
+    """Return a model itself, or that of a fit.
+
+    Raises:
+        InputError: neither of them.
+    """
+    model = given if isinstance(given, Model) else getattr(given, "model", None)
+    if isinstance(given, type) or not isinstance(model, Model):
+        raise InputError(
+            f"`model` must be a fitted model, or what estimate returns; got {show(given)}."
+        )
+    return model

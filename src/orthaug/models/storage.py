@@ -27,7 +27,7 @@ from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound, Learner, nothing_learned
-from orthaug.models.model import Model, TrainedSegments
+from orthaug.models.model import HoldsModel, Model, TrainedSegments, model_of
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.packed_files import has_files, pack, read_packed, write_packed
 from orthaug.models.starts import EstimatedStates
@@ -51,7 +51,7 @@ _SEGMENTATION = ("segment", "washout", "rows")  # of `TrainedSegments`
 _ON_SEGMENTS = ("states", "alone", "slope")
 
 
-def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
+def save(model: Model | HoldsModel, folder: str | Path, *, force: bool = False) -> None:
     """Write a model to a folder of its own, whole or not at all.
 
     A model that `save` wrote there before is replaced.
@@ -60,12 +60,12 @@ def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
     `load` asks for the callable.
 
     Args:
-        model: what to write.
+        model: what to write; of a fit its model.
         folder: a new one, or one that holds a saved model.
         force: replace the folder whatever it holds.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else.
+        InputError: no model; the folder cannot be written, or holds something else.
 
     Examples:
         >>> import tempfile
@@ -75,10 +75,11 @@ def save(model: Model, folder: str | Path, *, force: bool = False) -> None:
         >>> physics = oa.Baseline.from_terms([oa.Term("gain", "u[k]")])
         >>> fit = oa.estimate(record, physics, learner=None)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save(fit.model, Path(folder, "model"))
+        ...     save(fit, Path(folder, "model"))
         ...     load(Path(folder, "model"))
         Model(orthogonal, gain = 2, learner: none)
     """
+    model = model_of(model)
     with whole_folder(Path(folder), force=force) as partial:
         write(model, partial)
 

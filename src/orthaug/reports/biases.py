@@ -5,14 +5,15 @@ It selects the biases for a heat map, and formats its cells.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.lines import plain_number, plural
-from orthaug.analysis.findings import SuspectResult
+from orthaug._base.lines import percent, plain_number, plural
+from orthaug.analysis.causes import SURE_SHARE
+from orthaug.analysis.findings import NO_GUESS, SuspectResult
 from orthaug.analysis.fit_findings import ParameterResult
 
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
@@ -34,6 +35,8 @@ class BiasMap:
     shares: Matrix
     left_out: str
     """A sentence on what the map leaves out; empty where it is complete."""
+    sizes: tuple[str, ...]
+    """Sentences: how large each term counts, and how large the learner found it."""
 
     @property
     def colours(self) -> Matrix:
@@ -87,8 +90,29 @@ def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:
         f"Shown are those with the largest biases, {fewer}; result.json has all." if fewer else ""
     )
     return BiasMap(
-        tuple(names[j] for j in columns), tuple(shown), shares[np.ix_(rows, columns)], text
+        tuple(names[j] for j in columns),
+        tuple(shown),
+        shares[np.ix_(rows, columns)],
+        text,
+        tuple(_sizes(suspects)),
     )
+
+
+def _sizes(suspects: Sequence[SuspectResult]) -> Iterator[str]:
+    """Yield how large the terms count, and how large the learner found the one it shows."""
+    if any(suspect.coefficient is not None for suspect in suspects):
+        yield "A term with a guessed coefficient has the size of the guess."
+    free = [suspect for suspect in suspects if suspect.coefficient is None and suspect.size]
+    if free:
+        yield (
+            f"Without a guess, the bias is that of a term whose RMS is {percent(NO_GUESS)} of "
+            "the output's standard deviation."
+        )
+    best = max(free, key=lambda suspect: suspect.explained or 0.0, default=None)
+    if best is not None and (best.explained or 0.0) >= SURE_SHARE:
+        times = abs(best.coefficient_found or 0.0) * (best.size or 0.0) / NO_GUESS
+        large = f"{plain_number(times)} times as large"
+        yield f"The learner found {best.name} {large}, and so is its bias."
 
 
 def _largest_indices(size: np.ndarray, most: int) -> list[int]:

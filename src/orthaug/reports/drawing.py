@@ -108,6 +108,7 @@ def grid(
     gap: tuple[float, float] = (_GAP, _GAP),
     left: float = _LEFT,
     bottom: float = BOTTOM,
+    top: float = TOP,
     **options: Any,
 ) -> np.ndarray:
     """Return panels (rows, columns) at fixed places.
@@ -115,15 +116,15 @@ def grid(
     A layout found from the sizes of all texts takes longer than drawing.
 
     Args:
-        gap: inches between rows and columns; `left` and `bottom` those beside and below them.
+        gap: inches between rows and columns; `left`, `bottom` and `top` those around them.
     """
     width, height = figure.get_size_inches()
-    high, wide = height - TOP - bottom, width - left - RIGHT
+    high, wide = height - top - bottom, width - left - RIGHT
     place = {
         "left": left / width,
         "right": 1 - RIGHT / width,
         "bottom": bottom / height,
-        "top": 1 - TOP / height,
+        "top": 1 - top / height,
     }
     place["hspace"] = gap[0] * rows / max(high - gap[0] * (rows - 1), 0.1)
     place["wspace"] = gap[1] * columns / max(wide - gap[1] * (columns - 1), 0.1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orthaug._base.content import Flag, Number, Whole
 from orthaug._base.errors import Warning
-from orthaug._base.lines import fold, percent, table
+from orthaug._base.lines import continued, fold, percent, table
 from orthaug.analysis.findings import MemoryResult
 from orthaug.reports.result import ResultHeader
 from orthaug.selection.explanation import ExplainingTerm, MovedParameter, SingleTerm
@@ -46,11 +46,11 @@ def explain_text(result: ExplainResult) -> str:
             [_percent(one.share), *[one.added_to] * several, one.expression]
             for one in result.singles
         ]
-        blocks.append(table(rows))
+        blocks.append(table(continued(rows)))
     if result.memory:
         rows = [["share", "equation", "term with memory in the free run's residual"]]
         rows += [[_percent(one.share), one.equation, one.name] for one in result.memory[:_MEMORY]]
-        blocks.append(table(rows))
+        blocks.append(table(continued(rows)))
     if result.spec is not None:
         blocks.append(["Write into the spec, and fit again:", "", *result.spec.splitlines()])
     elif result.terms:

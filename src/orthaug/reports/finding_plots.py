@@ -33,7 +33,7 @@ from orthaug.reports.page_blocks import regressor_label, with_unit
 from orthaug.reports.recovery import RecoverResult, relative_errors
 
 _UPRIGHT = 11  # letters of a name that fit above one cell
-_CELL = 0.8  # inches
+_CELL, _LINE = 0.8, 0.17  # inches of a cell, and of a line of the title
 
 
 @plain
@@ -104,21 +104,21 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
         0.3 + 0.075 * max(map(len, shown.suspects)),
         BOTTOM if upright else 0.3 + 0.075 * longest,
     )
-    title = (
-        "bias of each parameter [%] by terms that may be missing (without a guess: of 1 % of "
-        "the output)"
+    title = "\n".join(
+        [
+            "bias of each parameter, % of its value, by each term that may be missing",
+            *shown.sizes,
+            f"Colours are logarithmic. {shown.left_out}".strip(),
+        ]
     )
-    title += (
-        f"\ncolours are logarithmic{'; ' if shown.left_out else ''}{shown.left_out[:1].lower()}"
-    )
-    title += shown.left_out[1:].rstrip(".")
     width = max(
         left + _CELL * len(shown.parameters) + RIGHT,
         SIZE[0],
         0.08 * max(map(len, title.split("\n"))),
     )
-    figure = Figure(figsize=(width, TOP + bottom + 0.28 * len(shown.suspects)))
-    ((axis,),) = grid(figure, 1, 1, left=left, bottom=bottom)
+    top = TOP + _LINE * max(title.count("\n") - 1, 0)
+    figure = Figure(figsize=(width, top + bottom + 0.28 * len(shown.suspects)))
+    ((axis,),) = grid(figure, 1, 1, left=left, bottom=bottom, top=top)
     axis.imshow(shown.colours, cmap="PuOr", vmin=-shown.reach, vmax=shown.reach, aspect="auto")
     for i, j in np.ndindex(*shown.shares.shape):
         color = "white" if abs(shown.colours[i, j]) > 0.6 * shown.reach else BLACK

@@ -10,7 +10,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from orthaug._base.lines import estimate_rows
+from orthaug._base.lines import BIASED_INTERVAL, estimate_rows
 from orthaug.analysis.fit_findings import Findings
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
@@ -197,7 +197,7 @@ def card_of_result(fit: Estimate, result: Findings) -> Card:
         for row, own in zip(parameters, cells, strict=True)
     ]
     if any(row.bias for row in parameters):
-        columns += ["bias", "95 % interval with it"]
+        columns += ["bias", BIASED_INTERVAL]
         wider = estimate_rows((row.value, None, row.ci95_with_bias) for row in parameters)
         for own, row, (*_, reach) in zip(rows, parameters, wider, strict=True):
             known = row.bias is None or row.bias.determined

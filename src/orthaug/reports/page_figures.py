@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from orthaug._base.lines import BIASED_INTERVAL
 from orthaug.analysis.findings import SuspectResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores, RestartResult
 from orthaug.analysis.residual_tests import RegressorResult, ResidualTestResult
@@ -52,9 +53,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
             "estimate": i == 0,
             "initial value": i == _first_row(drawn, _is_near),
         }
-        first["95 % interval less the bias"] = i == _first_row(
-            drawn, lambda r: bool(r.ci95_with_bias)
-        )
+        first[BIASED_INTERVAL] = i == _first_row(drawn, lambda r: bool(r.ci95_with_bias))
         for trace in _interval_traces(row):
             own = {"xaxis": f"x{number}", "yaxis": f"y{number}", "legendgroup": trace["name"]}
             traces.append({**own, **trace, "showlegend": first[trace["name"]]})
@@ -79,8 +78,7 @@ def interval_plot(rows: Sequence[ParameterResult]) -> Plot | None:
         "Every parameter has its own axis: the circle is the estimate, the thick bar its 95 % "
         "interval"
         + (
-            "; the thin bar is its 95 % interval once the bias is taken out, which need not "
-            "hold the estimate."
+            f"; the thin bar is its {BIASED_INTERVAL}, which need not hold the estimate."
             if biased
             else "."
         )
@@ -101,7 +99,7 @@ def _interval_traces(row: ParameterResult) -> list[dict[str, Any]]:
     """
     bars = {"95 % interval": (row.ci95, "@model", 7)}
     if row.ci95_with_bias and None not in row.ci95_with_bias:
-        bars = {"95 % interval less the bias": (row.ci95_with_bias, "@bias", 3), **bars}
+        bars = {BIASED_INTERVAL: (row.ci95_with_bias, "@bias", 3), **bars}
     found: list[dict[str, Any]] = [
         {
             "name": name,
@@ -375,10 +373,9 @@ def bias_plot(suspects: Sequence[SuspectResult]) -> Plot:
     }
     caption = (
         "Bias of each parameter (columns) by each term that may be missing from the physics "
-        "(rows), in per cent of its value. A term without a guessed size counts as 1 % of the "
-        "output. Colours are logarithmic."
+        "(rows), in per cent of its value."
     )
-    caption += f" {shown.left_out}" if shown.left_out else ""
+    caption = " ".join([caption, *shown.sizes, "Colours are logarithmic.", shown.left_out]).strip()
     height = 90 + 28 * len(shown.suspects)
     return Plot("Bias of each parameter by each suspected term.", caption, [heat], layout, height)
 

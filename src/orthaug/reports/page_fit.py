@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.lines import digits_for
+from orthaug._base.lines import BIASED_INTERVAL, digits_for
 from orthaug.analysis.findings import MotionFitResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.fitting.estimates import STD_KINDS
@@ -127,7 +127,7 @@ def _parameters(result: FitResult) -> list[Any]:
     between = "95 %, noise only" if result.noise_only else "95 % interval"
     columns = ["parameter", "value", "unit", "standard error", between, "initial"]
     biased = any(row.bias for row in rows)
-    columns += ["bias", "95 % interval with it"] if biased else []
+    columns += ["bias", BIASED_INTERVAL] if biased else []
     shared = any(row.shared is not None for row in rows)
     columns += ["learner could imitate it"] if shared else []
     caption = f"What was estimated. {text[result.standard_errors]}"
@@ -148,7 +148,7 @@ def _parameters(result: FitResult) -> list[Any]:
     if biased:
         caption += f"{BIAS_TOLD[:-1]};"
         caption += (
-            " the interval with it is the hull over all causes that noise cannot distinguish."
+            " the interval with the bias is the hull over all causes that noise cannot distinguish."
         )
     blocks: list[Any] = [
         Table(caption, columns, [_parameter_cells(row, biased, shared) for row in rows])
@@ -406,7 +406,10 @@ def _shares(page: FitPage) -> list[Any]:
         "marker": {"color": "@learner"},
     }
     largest = max((x for x in bars["x"] if x is not None), default=0.0)
-    axis = {"title": {"text": "share of the learner [%]"}, "range": [0, 1.05 * largest or 100.0]}
+    end = min(1.05 * largest, 100.0) or 100.0
+    end = end if largest <= 100 else 1.05 * largest
+    title = f"share of the learner [%]; the axis ends at {percent(end / 100)}"
+    axis = {"title": {"text": title}, "range": [0, end]}
     layout = {"xaxis": axis, "yaxis": CATEGORIES, "showlegend": False}
     text = "The learner's RMS over that of physics and learner together."
     if result.structure == "orthogonal":

@@ -317,7 +317,7 @@ def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
     worst = max(rows, key=_errors_of)
     if worst.bias is None or worst.bias.value is None:
         return ""
-    times = f"{float(plain_number(_errors_of(worst))):,g} times its standard error"
+    times = f"{plain_number(_errors_of(worst))} times its standard error"
     share = percent(worst.bias.value / worst.value, signed=True) if worst.value else ""
     size = f"{share}, {times}" if share else times
     return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"

@@ -30,7 +30,11 @@ _TERMS = ("baseline", "terms")
 _PHYSICS = {"terms": "a sum of terms", "motion": "equations of motion"}
 _MOTION = {"states": "States", "parameters": "Parameters"}
 _LEARNERS = {"mlp": "a network", "terms": "a sum of terms", "none": "none: physics alone"}
-_FOCUS = {"prediction": "one step ahead", "simulation": "the free run"}
+_FOCUS = {
+    "auto": "automatic",
+    "prediction": "one step ahead",
+    "simulation": "the free run",
+}
 _MULTIPLE = 1e5  # % from which a change is given in words
 _ROUNDING = 1e-7  # % below which it counts as none
 _STRUCTURES = {
@@ -279,8 +283,12 @@ class ModelView:
             with ui.element("div").classes("fields"):
                 structure = str(spec_text.section(content, "structure").get("kind", "orthogonal"))
                 choice("structure", _STRUCTURES, structure, self._value("structure", "kind"))
-                focus = str(training.get("focus", "simulation" if moves else "prediction"))
-                choice("trained on", _FOCUS, focus, self._value("training", "focus"))
+                choice(
+                    "trained on",
+                    _FOCUS,
+                    _focus_of(training, moves=moves),
+                    self._value("training", "focus"),
+                )
                 for label, key, hint in (
                     ("starts", "restarts", "1"),
                     ("iterations", "iterations", ""),
@@ -375,8 +383,8 @@ def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> 
     if bias:
         text("What would bias the parameters", "h3")
         hint = (
-            "The bias if such a term is missing from the physics, with the size that the spec "
-            "gives, or 1 % of the output's."
+            "The bias if such a term is missing from the physics. Its size is that of the spec, "
+            "or else its RMS is 1 % of the output's standard deviation."
         )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
@@ -415,6 +423,12 @@ def _units(units: Sequence[tuple[str, str, str | None]], *, moves: bool) -> None
             "p",
             "hint",
         )
+
+
+def _focus_of(training: Mapping[str, Any], *, moves: bool) -> str:
+    """Return the focus that a spec's section asks for, or its default."""
+    ahead = "prediction" if training.get("horizon", 1) != 1 else "auto"
+    return str(training.get("focus", "simulation" if moves else ahead))
 
 
 def _biases(percents: Mapping[str, float | None]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from nicegui import ui
 
+from orthaug._base.lines import BIASED_INTERVAL
 from orthaug._base.progress import Stage
 from orthaug.commands.app.kept_results import KeptResult
 from orthaug.commands.app.processes import Command, Run
@@ -316,6 +317,9 @@ def _interval_plot(
     if any(rows for _, rows in models):
         names = ", ".join(name for name, _ in models)
         plot(interval_figure(models, units), f"Parameters with 95 % intervals of {names}.")
+        if any(row.get("ci95_with_bias") for _, rows in models for row in rows):
+            hint = f"The thin bar is the {BIASED_INTERVAL}; it need not hold the estimate."
+            text(hint, "p", "hint")
 
 
 def _runs_caption(runs: set[Run]) -> str:
@@ -350,11 +354,11 @@ def _parameters(
 ) -> None:
     """Draw the parameters of one model, or of several by name; `units` are the implied ones."""
     named, cells = any(name for name, _ in models), []
+    biased = any(row.get("bias") for _, rows in models for row in rows)
     for name, rows in models:
         for row in rows:
-            low, high = row["ci95"] or (None, None)
-            reach = "–" if low is None and high is None else f"{number(low)} … {number(high)}"
-            own = (number(row["value"], 6), number(row["std"], 3), reach)
+            own = [number(row["value"], 6), number(row["std"], 3), _interval(row["ci95"])]
+            own += _bias_cells(row) if biased else []
             unit = row["unit"] or units.get(row["name"]) or "–"
             cells.append((*([name] if named else []), row["name"], *own, unit))
     head = (
@@ -363,9 +367,23 @@ def _parameters(
         "value",
         "standard error",
         "95 % interval",
+        *(["bias", BIASED_INTERVAL] if biased else []),
         "unit",
     )
     table(head, cells, caption)
+
+
+def _interval(ends: Sequence[float | None] | None) -> str:
+    low, high = ends or (None, None)
+    return "–" if low is None and high is None else f"{number(low)} … {number(high)}"
+
+
+def _bias_cells(row: Mapping[str, Any]) -> list[str]:
+    """Return the bias of a parameter, and the interval that covers it."""
+    bias = row.get("bias") or {"value": None, "determined": True}
+    known = bias.get("determined", True)
+    reach = _interval(row.get("ci95_with_bias")) if known else "not determined by these data"
+    return [number(bias["value"], 3), reach]
 
 
 def _output_units(result: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from nicegui import ui
 
+from orthaug._base.lines import BIASED_INTERVAL
 from orthaug.commands.app.processes import Run
 from orthaug.commands.job import PHYSICS_ONLY
 
@@ -232,7 +233,10 @@ def curves_figure(
 def interval_figure(
     models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return a figure of each parameter in every model, with its 95 % interval."""
+    """Return a figure of each parameter in every model, with its 95 % interval.
+
+    A thin bar is the interval with the bias, which need not hold the estimate.
+    """
     names = list(dict.fromkeys(row["name"] for _, rows in models for row in rows))
     one = 22 * len(models) + 8  # px of the dots of a parameter, with its axis below
     whole = (one + _AXIS) * len(names)
@@ -259,6 +263,15 @@ def interval_figure(
             low, high = row["ci95"] or (None, None)
             bar = [0.0 if end is None else abs(end - row["value"]) for end in (high, low)]
             color = _COLORS[j % len(_COLORS)]
+            if wide := row.get("ci95_with_bias"):
+                traces.append(
+                    {
+                        **{"type": "scatter", "mode": "lines", "name": BIASED_INTERVAL},
+                        **{"x": wide, "y": [escape(model)] * 2, "opacity": 0.6},
+                        **{"xaxis": f"x{axis}", "yaxis": f"y{axis}"},
+                        "line": {"width": 1, "color": color},
+                    }
+                )
             traces.append(
                 {
                     **{"type": "scatter", "mode": "markers", "name": escape(model)},
@@ -291,11 +304,15 @@ def of_several(runs: Iterable[Run]) -> bool:
 def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
     """Return a figure of the loss of every run over its iterations.
 
-    Each run has a name below the axis; of several structures, each structure has one.
+    Each run has a name below the axis; of several structures, each structure has one. A curve is
+    broken where its run begins again.
     """
-    runs: dict[Run, tuple[list[int], list[float | None]]] = {}
+    runs: dict[Run, tuple[list[int | None], list[float | None]]] = {}
     for run, iteration, loss in losses:
         x, y = runs.setdefault(run, ([], []))
+        if x and iteration <= (x[-1] or 0):  # it began again, such as on the free run
+            x.append(None)
+            y.append(None)
         x.append(iteration)
         y.append(loss)
     several = of_several(runs)

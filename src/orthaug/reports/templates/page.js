@@ -159,6 +159,28 @@
   const home = (figure) => figure.layout.xaxis?.range ?? [0, 1];
   const isSampled = (figure) => figure.data.some((trace) => trace.series || trace.minus);
 
+  /* Red, green and blue of a colour #rgb or #rrggbb, from 0 to 1. */
+  function parts(text) {
+    const digits = text.length < 5 ? [...text.slice(1)].map((d) => d + d) : text.slice(1).match(/../g);
+    return digits.map((pair) => parseInt(pair, 16) / 255);
+  }
+  const linear = (part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4);
+  const luminance = (rgb) => [0.2126, 0.7152, 0.0722].reduce((sum, weight, i) => sum + weight * linear(rgb[i]), 0);
+
+  /* The numbers of a map's cells, black on light colours and white on dark ones. */
+  function numbers(trace) {
+    const scale = trace.colorscale.map(([at, text]) => [at, parts(text)]);
+    const shade = (value) => {
+      const share = Math.min(1, Math.max(0, (value - trace.zmin) / (trace.zmax - trace.zmin)));
+      const k = Math.max(1, scale.findIndex(([at]) => share <= at)), [[from, low], [to, high]] = [scale[k - 1], scale[k]];
+      return low.map((part, i) => part + ((share - from) / (to - from)) * (high[i] - part));
+    };
+    const ink = (value) => (luminance(shade(value ?? (trace.zmin + trace.zmax) / 2)) > 0.179 ? "#000000" : "#ffffff");
+    return trace.z.flatMap((row, i) => row.map((value, j) => ({
+      x: j, y: i, text: trace.text[i][j], showarrow: false, font: { size: trace.textfont.size, color: ink(value) },
+    })));
+  }
+
   function draw(place) {
     const figure = figures[place.dataset.figure], from = style();
     const now = place.layout && isSampled(figure) ? place.layout.xaxis.range : home(figure);
@@ -167,7 +189,12 @@
     if (isSampled(figure)) shown.xaxis.range = [...now];
     const drawn = traces(figure, now);
     if (isNarrow(shown.width) && lettered(figure)) drawn.forEach((trace) => { trace.textfont = { size: 8 }; });
-    return Plotly.react(place, coloured(drawn, from), shown, CONFIG);
+    const painted = coloured(drawn, from);
+    painted.filter((trace) => trace.texttemplate).forEach((trace) => {
+      shown.annotations = numbers(trace);
+      delete trace.texttemplate;
+    });
+    return Plotly.react(place, painted, shown, CONFIG);
   }
 
   /* After a zoom the curves are drawn anew, as finely as they are now seen. */
