@@ -385,6 +385,21 @@ def test_explain_takes_the_rows_of_training_and_several_files(project, tmp_path)
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_explain_leaves_out_missing_cells_or_refuses_them(project, tmp_path):
+    """Without --missing, gaps of other files are left out."""
+    columns = {name: column[:200].copy() for name, column in system(-0.3).items()}
+    columns["y"][[100, 199]] = np.nan
+    write_csv(tmp_path / "gaps.csv", **columns)
+    given = ("explain", project / "plant", tmp_path / "gaps.csv", "--json")
+    plain, skipped = run(*given), run(*given, "--missing", "skip")
+    assert plain.code == skipped.code == 0 and plain.out == skipped.out
+    refused = run(*given, "--missing", "error")
+    assert refused.code == 2
+    assert one_line(refused.err, "column 'y'", "--missing skip leaves such rows out")
+    assert one_line(run(*given, "--missing", "drop").err, "--missing", "'drop'")
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_wrong_use_is_told_in_a_line(project):
     refused = run("explain", project / "alone", project / "run.csv")
     assert refused.code == 2 and one_line(refused.err, "physics alone")
