@@ -13,6 +13,7 @@ import pytest
 from orthaug import InputError
 from orthaug.data import tables
 from orthaug.data.layouts import layout
+from orthaug.data.survey import survey
 from orthaug.data.tables import check_readable, column_names, has_column, read_table
 
 
@@ -315,7 +316,7 @@ def test_a_row_of_a_file_without_header_is_named_by_its_line(tmp_path):
     assert layout(path).note == "no header, so the columns are called x1 to x2"
     with pytest.raises(
         InputError,
-        match="line 3 has 3 cells and line 1 has 2; is a separator or a decimal comma wr",
+        match="line 3 has 3 cells, line 1 has 2. Correct the line: is a separator or a decimal",
     ):
         read_table(put(tmp_path, "run.dat", "1 2\n3 4\n5 6 7\n"), ["x1"])
 
@@ -570,3 +571,29 @@ def test_a_cut_parquet_file(tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(InputError, match="run.parquet: not a readable Parquet file"):
         read_table(path, ("y",))
+
+
+def test_a_line_with_too_many_cells_is_counted(tmp_path):
+    rows = [f"{k},{k % 3},{k % 5}\n" for k in range(30)]
+    rows[10] = "10,1,0,7,8\n"
+    path = put(tmp_path, "run.csv", "t,u,y\n" + "".join(rows))
+    wanted = "line 12 has 5 cells, the header has 3. Correct the line: is a separator or a decimal"
+    for look in (lambda: read_table(path, ["u"]), lambda: survey(path)):
+        with pytest.raises(InputError, match=wanted):
+            look()
+    rows[10] = rows[20] = "20,1,0,7\n"
+    path = put(tmp_path, "run.csv", "t,u,y\n" + "".join(rows))
+    with pytest.raises(InputError, match="the header has 3; 2 lines have too many"):
+        survey(path)
+
+
+@pytest.mark.parametrize("step", ["0,10", "0,00"])
+def test_decimal_commas_between_commas_are_a_question(tmp_path, step):
+    rows = "".join(f"{k},{k % 10}0,1,5{k},{step}\n" for k in range(30))
+    path = put(tmp_path, "run.csv", "Zeit,Druck,Weg\n" + rows)
+    wanted = (
+        "line 2 has 6 cells under 3 names, and so have most lines. Perhaps the decimals have "
+        "commas, too: export the table with ; as separator"
+    )
+    with pytest.raises(InputError, match=wanted):
+        survey(path)

@@ -101,6 +101,12 @@ class Layout(NamedTuple):
         with path.open(encoding=self.encoding, newline="") as file:
             return pattern.search("".join(islice(file, self.header_line, None))) is not None
 
+    def count_cells(self, path: Path, line: int) -> int:
+        """Return the number of cells in a line of the file, counted from 1."""
+        with path.open(encoding=self.encoding, newline="") as file:
+            text = next(islice(file, line - 1, None), "")
+        return len(_row(text.rstrip("\r\n"), self.separator))
+
 
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
     """Find the layout of a text table; remarks above its header are skipped.

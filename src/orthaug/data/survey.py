@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.checks import Vector, nearest
-from orthaug._base.errors import InputError, show
+from orthaug._base.errors import InputError, SurplusCellsError, show
 from orthaug._base.lines import join_words
 from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
@@ -201,6 +201,8 @@ def survey(path: Path) -> Survey:
     table, refused = {}, None
     try:
         table = read_table(path, headers).columns
+    except SurplusCellsError:
+        raise
     except InputError as error:  # one of them cannot be read: each by itself
         refused = error
     for header in headers:
