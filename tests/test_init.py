@@ -20,6 +20,7 @@ from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
+from orthaug.data.headers import with_unit
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
 from orthaug.selection import first_orders
@@ -431,6 +432,13 @@ def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
     done = run("init", tmp_path / "run.csv", "run2.csv", "run3.csv", *options)
     assert done.code == 2 and "'run2.csv, run3.csv' besides" in done.err
     assert "add the others to `files` of `train`" in unfolded(done.err)
+
+
+def test_a_row_of_units_is_right_where_the_header_has_a_remark_in_parentheses():
+    assert split_header(with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
+    assert split_header(with_unit("Kraft (N)", "N")) == ("Kraft", "N")
+    assert split_header(with_unit("Kraft (N)", "")) == ("Kraft", "N")
+    assert split_header(with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
 
 
 def test_units_in_the_row_under_the_header(tmp_path):

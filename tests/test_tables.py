@@ -129,6 +129,43 @@ def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, 
     assert values(path, "u", "y") == [[1.5, 3.0], [2.0, 4.5]]
 
 
+@pytest.mark.parametrize(
+    "above",
+    [
+        "Messung;Stand 4;\n",
+        "Messung 7;;\nDatum: 3.4.2025;;\n;;\n",
+        "Stand;4;\n",
+        "\nMessung\nStand;4;\n",
+    ],
+)
+@pytest.mark.parametrize("units", ["", "[s];[kN];[mm]\n"])
+def test_lines_that_excel_padded_above_the_header_are_no_header(tmp_path, above, units):
+    header = "Zeit;Druck (Luft);Weg\n"
+    path = put(tmp_path, "run.csv", f"{above}{header}{units}0,0;1;2\n0,1;3;4,5\n0,2;;\n")
+    assert column_names(path) == ["Zeit", "Druck (Luft)", "Weg"]
+    assert values(path, "Druck (Luft)", "Weg") == [[1.0, 3.0], [2.0, 4.5]]
+    table = read_table(path, ["Weg"])
+    assert table.first_line == f"{above}{header}{units}".count("\n") + 1
+    assert table.units == ({"Zeit": "s", "Druck (Luft)": "kN", "Weg": "mm"} if units else {})
+
+
+def test_lines_above_the_header_of_a_worksheet(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in ([], ["Messung 7"], ["Stand", 4], [], ["t", "u", "y"], [0, 1, 2], [1, None, 4]):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    assert column_names(tmp_path / "run.xlsx") == ["t", "u", "y"]
+    table = read_table(tmp_path / "run.xlsx", ["t", "y"])
+    assert [table.columns[name].tolist() for name in ("t", "y")] == [[0.0, 1.0], [2.0, 4.0]]
+    assert table.where(0) == "line 6 (row 0)"
+
+
+def test_a_row_of_units_is_not_taken_for_the_header_above_which_a_name_lacks(tmp_path):
+    path = put(tmp_path, "run.csv", "t,,y\ns,V,m\n0,1,2\n1,3,4\n")
+    assert column_names(path) == ["t", "y"]
+
+
 UNITS_UNDER_NAMES = {
     "all": ("t,u,y\nms,V,cm\n20,1,2\n40,3,4\n", {"t": "ms", "u": "V", "y": "cm"}),
     "brackets": ("t;u;y\n[ms];(V);[%]\n20;1;2\n40;3;4\n", {"t": "ms", "u": "V", "y": "%"}),

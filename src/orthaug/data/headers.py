@@ -69,8 +69,19 @@ def split_header(header: str) -> tuple[str, str]:
 
 
 def with_unit(header: str, unit: str) -> str:
-    """Return a header with the unit that is elsewhere, as under it; one of its own stays."""
-    return f"{header} [{unit}]" if unit and not split_header(header)[1] else header
+    """Return a header with the unit that is elsewhere, as under it; one of its own stays.
+
+    What is in parentheses need not be a unit, as in `force (drive)`: it stays a part of the name.
+    """
+    own = split_header(header)[1]
+    remark = own != unit and header.rstrip().endswith(")")
+    return f"{header} [{unit}]" if unit and (not own or remark) else header
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a cell is a unit: one that is common, or in square brackets."""
+    bare = text.strip()
+    return re.fullmatch(r"\[[^\[\]]*\]", bare) is not None or _UNITS.fullmatch(bare) is not None
 
 
 def last_part(name: str) -> str:
