@@ -225,7 +225,9 @@ def open_run(
         # A state to predict from
         estimated = need_outputs and loaded.form.states and not loaded.form.memory
         first = loaded.form.first_row + ahead + bool(estimated)
-        record, text = long_stretches(record, [0] * len(record.experiments), first)
+        keep = "--missing keep runs through missing outputs" if loaded.form.takes_gaps else ""
+        stretches = [0] * len(record.experiments)
+        record, text = long_stretches(record, stretches, first, remedy=keep)
         notes += (f"note: {data}: {text}",)
     begin = 0 if reading.rows is None else int(np.ravel(reading.rows)[0])
     return ModelOnData(loaded, record, data, rows, notes, first_row=begin)

@@ -157,10 +157,7 @@ def read_record(
         )
         return _with_instants(record, table.columns[time], recorded)
     if time and not steps:
-        raise InputError(
-            f"{path}: no two rows without missing cells follow each other; the sampling time "
-            "is unknown."
-        )
+        steps = _steps_of(table, time, ranges)
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
     if others := [other for other in steps if not same_step(other, step)]:
         steps_text = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
@@ -495,6 +492,23 @@ def _with_instants(record: Record, instants: Vector, recorded: int) -> Record:
     mean = float(np.mean(np.concatenate([one.steps[:-1] for one in found])))
     missing = recorded - sum(map(len, found))
     return replace(record, experiments=tuple(found), sampling_time=mean, missing=missing)
+
+
+def _steps_of(table: Table, time: str, ranges: Sequence[tuple[int, int]]) -> list[float]:
+    """Return the step of each range by all of its instants, where every other row has gaps.
+
+    Raises:
+        InputError: instants that are missing or uneven.
+    """
+    complete = [
+        (a, b) for a, b in ranges if np.isfinite(table.columns[time][a:b]).all() and b > a + 1
+    ]
+    if not complete:
+        raise InputError(
+            f"{table.path}: no two rows without missing cells follow each other, and column "
+            f"'{time}' has missing cells, too; the sampling time is unknown."
+        )
+    return [_uniform_step(table, time, a, b) for a, b in complete]
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:
