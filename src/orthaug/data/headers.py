@@ -37,10 +37,13 @@ _OF_TIME = re.compile(rf"(.+)_({'|'.join([*_PARTS, *_MULTIPLES])})")
 _DATES = {
     ".": ("%d.%m.%Y", "%d.%m.%y"),
     "/": ("%d/%m/%Y", "%m/%d/%Y", "%Y/%m/%d"),
-    "-": ("%d-%m-%Y",),
+    "-": ("%d-%m-%Y", "%Y-%m-%d"),
     ":": ("",),
 }
-_TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p")
+_TIMES = (
+    *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M"),
+    *("%I:%M:%S %p", "%I:%M:%S.%f %p", "%I:%M %p"),
+)
 _MOST_OF = 0.9  # share of the cells that have to be dates
 _COMMA = r"(:\d\d),(\d+)"
 

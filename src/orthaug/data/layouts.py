@@ -26,7 +26,7 @@ from orthaug.data.headers import is_unit
 _REMARK = ("#", "%")  # lines above the header that begin so
 _NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*')
 _COMMA = re.compile(r"(\d*),(\d+)")
-_DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
+_DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\d(?:Z| ?[AaPp][Mm])?")
 MISSING = ("", "nan", "na", "n/a", "#n/a", "n.a.", "n.v.", "null", "none", "-", "--")
 """Words of a cell without a sample, in small letters."""
 _NO_UNIT = ("", "-", "--")  # cells of a row of units without one
