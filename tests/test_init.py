@@ -15,6 +15,7 @@ import scipy.io
 import scipy.signal
 from helpers import unfolded
 from test_cli import run
+from test_first_orders import crane
 
 from orthaug import load_spec
 from orthaug.commands import cli
@@ -620,6 +621,18 @@ def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
     assert (
         "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
     )
+
+
+def test_a_dead_time_that_the_data_do_not_determine_is_a_guess_in_the_spec(tmp_path):
+    record = crane(4)
+    (one,) = record.experiments
+    columns = {"F": one.inputs[:, 0], "pos": one.outputs[:, 0], "swing": one.outputs[:, 1]}
+    pd.DataFrame(columns).to_csv(tmp_path / "a.csv", index=False)
+    roles = ("--inputs", "F", "--outputs", "pos", "swing")
+    done = run("init", tmp_path / "a.csv", *roles, "--out", tmp_path / "spec.toml")
+    assert "several lags of it act together, and the data do not determine" in unfolded(done.out)
+    written = (tmp_path / "spec.toml").read_text(encoding="utf-8")
+    assert "# the data do not determine its first lag, so this is a guess" in written
 
 
 def test_the_focus_is_left_to_the_data(tmp_path):

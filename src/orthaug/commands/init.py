@@ -496,8 +496,10 @@ def _account(
         used.add(id(found.clock.faulty))  # the line of the sampling time tells its fault
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
-    for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
-        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
+    for column, delay, order, unsure in zip(
+        roles.inputs, model.delays, model.persistence, model.undetermined, strict=True
+    ):
+        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay, unsure)}")
     if roles.every > 1:
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
@@ -569,7 +571,12 @@ def _account(
     return "\n".join(lines)
 
 
-def _delay(delay: int | None) -> str:
+def _delay(delay: int | None, undetermined: bool) -> str:
+    if undetermined:
+        return (
+            "several lags of it act together, and the data do not determine the first: a dead "
+            "time is not seen"
+        )
     if delay is None:
         return "no lag of it is significant"
     last = (
