@@ -17,6 +17,7 @@ from helpers import unfolded
 from test_cli import run
 from test_first_orders import crane
 
+import orthaug as oa
 from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
@@ -227,6 +228,29 @@ def test_a_delay_is_seen_where_the_response_sets_in_slowly(tmp_path, held):
         "init", tmp_path / "a.csv", "--sampling-time", "0.01", "--out", tmp_path / "spec.toml"
     )
     assert "it is first significant at lag 4" in done.out and ", nk 4;" in done.out
+
+
+def test_the_turning_points_of_an_encoder_are_no_limit(tmp_path):
+    t = np.arange(4000.0)
+    counts = np.round(600 * np.sin(0.004 * t) * np.exp(-t / 4000))
+    clipped = np.clip(counts, None, counts.max() - 100)
+    frame = pd.DataFrame(
+        {"counts": counts, "clipped": clipped, "both": np.tile(counts[:1500], 3)[:4000]}
+    )
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    found = survey(tmp_path / "a.csv")
+    assert np.sum(counts == counts.max()) >= 6
+    assert found.find("counts").limits == () and found.find("both").limits == ()
+    assert found.find("clipped").limits == ((clipped.max(), int(np.sum(clipped == clipped.max()))),)
+
+
+@pytest.mark.parametrize("decimals", [2, 4, None])
+def test_the_rounding_of_a_slow_sine_excites_nothing(decimals):
+    u = 20 + 4 * np.sin(2 * np.pi * np.arange(1500) / 287)
+    u = u if decimals is None else np.round(u, decimals)
+    y = scipy.signal.lfilter([0, 0.2], [1, -0.8], u)
+    record = oa.Record.from_arrays(u, y + 0.01 * np.random.default_rng(0).normal(size=1500))
+    assert first_orders.first_model(record).persistence[0] <= 3
 
 
 def test_what_is_seen_of_a_column(tmp_path):
@@ -624,9 +648,14 @@ def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
 
 
 def test_a_dead_time_that_the_data_do_not_determine_is_a_guess_in_the_spec(tmp_path):
-    record = crane(4)
+    record = crane(0, rows=1600)
     (one,) = record.experiments
-    columns = {"F": one.inputs[:, 0], "pos": one.outputs[:, 0], "swing": one.outputs[:, 1]}
+    columns = {
+        "t": 0.05 * np.arange(1600),
+        "F": one.inputs[:, 0],
+        "pos": one.outputs[:, 0],
+        "swing": one.outputs[:, 1],
+    }
     pd.DataFrame(columns).to_csv(tmp_path / "a.csv", index=False)
     roles = ("--inputs", "F", "--outputs", "pos", "swing")
     done = run("init", tmp_path / "a.csv", *roles, "--out", tmp_path / "spec.toml")

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.data.columns import quantum_of
 from orthaug.data.record import Experiment, Record
 from orthaug.data.sources import RecordSource, witness
 from orthaug.selection.linear_runs import (
@@ -33,6 +34,9 @@ _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are take
 _BETTER = 1.2
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
+_FINE = 0.01  # steps of an input over its deviation, below which they are those of the recording
+_PLACES = 9  # decimals that a recording may have been rounded to
+_ROUNDED = 3.0  # times the singular value that the rounding of a recording has by itself
 _EXACT = 1e-4  # of the output's deviation: below, more lags follow the rounding
 MOST_DELAY = 20
 """The largest delay that is looked for."""
@@ -462,14 +466,30 @@ def _tested_delay(record: Record, number: int, most: int) -> int | None:
 
 
 def _persistence(record: Record, number: int) -> int:
-    """Return the rank of the matrix of an input's lags, its mean removed."""
+    """Return the rank of the matrix of an input's lags, its mean removed.
+
+    What the rounding of fine steps adds does not count: it excites no output.
+    """
     longest = max(record.experiments, key=len).inputs[:, number]
     n = min(PERSISTENCE, len(longest) // 3)
     if n < 1:
         return 1
     lagged = np.lib.stride_tricks.sliding_window_view(longest - longest.mean(), n)
     values = np.linalg.svd(np.linalg.qr(lagged, mode="r"), compute_uv=False)
-    return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
+    step = quantum_of(longest) or _decimal_step(longest)
+    fine = step < _FINE * float(longest.std())
+    rounding = _ROUNDED * step * np.sqrt(len(lagged) / 12) if fine else 0.0
+    return int((values > max(_EXCITED * values[0], rounding)).sum()) if values[0] > 0 else 0
+
+
+def _decimal_step(values: Vector) -> float:
+    """Return the power of ten that all values are multiples of; 0 where none is seen."""
+    steps = (10.0**-places for places in range(_PLACES + 1))
+    exact = 1e-12 * float(np.abs(values).max())
+    return next(
+        (one for one in steps if (np.abs(values - one * np.round(values / one)) <= exact).all()),
+        0.0,
+    )
 
 
 def _errors(
