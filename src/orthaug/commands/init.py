@@ -548,7 +548,8 @@ def _account(
         where = f"rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
     shown = ", ".join(percent(error, 3) for error in errors)
     lines.append(
-        f"first physics: {physics}; its free run leaves the outputs on {where}"
+        f"first physics: {physics}; its free run diverges: the error is over {_LOST:g} times the "
+        f"output's standard deviation on {where}"
         if max(errors) > _LOST
         else f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
         f"deviation on {where}"
@@ -556,9 +557,9 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            f"orders are the best of runs that start again every {model.restarted} rows, with an "
-            f"error of {shown}, for longer ones drift on the last {percent(1 - FITTED)} of rows 0 "
-            f"to {cut}"
+            f"the orders come from runs of {model.restarted} rows, each from measured outputs on, "
+            f"since longer runs drift away: their error is {shown} on the last "
+            f"{percent(1 - FITTED)} of rows 0 to {cut}"
         )
     if cut - missing > LOOKED_AT:
         lines.append(
