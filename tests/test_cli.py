@@ -744,7 +744,10 @@ def data(rows: str, header: str = "u,y") -> dict[str, str]:
 ROWS = "".join(f"{(k * 7) % 5},{(k * 3) % 11}\n" for k in range(20))
 BAD = {  # what is put in the place of files ("" replaces a piece of the spec), and words of the message
     "missing column": (data(ROWS, "u,position"), ["run.csv", "no column 'y'", "'position'"]),
-    "unequal lengths": (data(ROWS + "1,\n"), ["run.csv", "unequal lengths", "'u' 21", "'y' 20"]),
+    "unequal lengths": (
+        data(ROWS + "1,\n"),
+        ["run.csv", "line 22 (row 20)", "'y': the cell is empty", "'u' goes on to row 20"],
+    ),
     "NaN cell": (
         data(ROWS + "1,NaN\n3,4\n"),
         ["run.csv", "line 22 (row 20)", "column 'y'", "'NaN'", "finite number"],

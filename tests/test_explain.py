@@ -138,6 +138,32 @@ def test_an_expression_with_commas_is_told_as_it_is_written():
     assert ", " in term.expression and told.text.startswith(f"{term.expression} explains")
 
 
+def test_terms_of_several_equations_are_named_with_them():
+    rng = np.random.default_rng(5)
+    u, y = rng.uniform(-1, 1, ROWS), np.zeros((ROWS, 2))
+
+    def plant(x):
+        cubes = x[:, :2] ** 3
+        return np.column_stack([x @ [0.6, 0.1, 0.5], x @ [0.0, 0.5, 0.4]]) - 0.2 * cubes[:, [0, 0]]
+
+    for k in range(1, ROWS):
+        y[k] = plant(np.array([[*y[k - 1], u[k - 1]]]))[0]
+    lags = ("y1[k-1]", "y2[k-1]", "u[k-1]")
+    terms = [
+        oa.Term(f"{name}{place}", lag, output=place)
+        for place in ("y1", "y2")
+        for name, lag in zip("abc", lags, strict=True)
+    ]
+    record = oa.Record.from_arrays(u, y, outputs=["y1", "y2"])
+    found = oa.explain(oa.orthogonalize(record, oa.Baseline.from_terms(terms), plant))
+    assert {(term.expression, term.added_to) for term in found.terms} == {
+        ("y1[k-1]**3", "y1"),
+        ("y1[k-1]**3", "y2"),
+    }
+    first, second = (f"y1[k-1]**3 in {term.added_to}" for term in found.terms)
+    assert found.text.startswith(f"{first} and {second} explain 100 %")
+
+
 def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_reverse():
     rng = np.random.default_rng(4)
     kinds = {}
@@ -386,6 +412,21 @@ def test_explain_takes_the_rows_of_training_and_several_files(project, tmp_path)
     result["spec"]["data"]["train"]["rows"] = "abc"
     (tmp_path / "part" / "result.json").write_text(json.dumps(result), encoding="utf-8")
     assert run("explain", tmp_path / "part", project / "run.csv", "--json").err == ""
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_explain_leaves_out_missing_cells_or_refuses_them(project, tmp_path):
+    """Without --missing, gaps of other files are left out."""
+    columns = {name: column[:200].copy() for name, column in system(-0.3).items()}
+    columns["y"][[100, 199]] = np.nan
+    write_csv(tmp_path / "gaps.csv", **columns)
+    given = ("explain", project / "plant", tmp_path / "gaps.csv", "--json")
+    plain, skipped = run(*given), run(*given, "--missing", "skip")
+    assert plain.code == skipped.code == 0 and plain.out == skipped.out
+    refused = run(*given, "--missing", "error")
+    assert refused.code == 2
+    assert one_line(refused.err, "column 'y'", "--missing skip leaves such rows out")
+    assert one_line(run(*given, "--missing", "drop").err, "--missing", "'drop'")
 
 
 @pytest.mark.usefixtures("without_figures")

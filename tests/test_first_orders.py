@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from orthaug import Record
-from orthaug.selection.first_orders import first_model
+from orthaug.selection.first_orders import first_model, first_significant_lag
 
 
 def tank(seed: int, rows: int = 600) -> Record:
@@ -134,3 +134,36 @@ def test_a_poor_run_does_not_correct_the_lag_that_a_test_found() -> None:
     assert model is not None
     assert model.orders.nk == (3,)
     assert min(model.free_run) > 0.3
+
+
+def crane(seed: int, rows: int = 1200) -> Record:
+    """A trolley with a swinging load, both measured: a force acts at once, weakly in each row."""
+    rng = np.random.default_rng(seed)
+    force = 30 * np.sin(np.outer(np.arange(rows), [0.021, 0.034, 0.083, 0.13]) + [0, 1, 2, 3])
+    force = np.round(force.mean(axis=1))
+    x = np.zeros(4)
+    found = []
+    for push in force:
+        found.append(x.copy())
+        for _ in range(10):
+            swing = -9.81 * x[2] - 0.3 * x[3] - (push - 4 * x[1]) / 8
+            x = x + 0.005 * np.array([x[1], (push - 4 * x[1]) / 8 + 3 * x[2], x[3], swing / 1.2])
+    y = np.array(found)[:, [0, 2]]
+    return Record.from_arrays(force, y + 0.02 * y.std(axis=0) * rng.normal(size=y.shape))
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_lag_before_which_others_act_is_no_dead_time(seed):
+    model = first_model(crane(seed))
+    assert model is not None and model.orders.nk[0] <= 1
+    assert (model.delays, model.undetermined) == ((None,), (True,))
+
+
+@pytest.mark.parametrize("delay", [2, 3, 5, 10])
+@pytest.mark.parametrize("kind", ["white", "steps"])
+def test_a_dead_time_is_found_beside_the_rows_before_it(delay, kind):
+    rng = np.random.default_rng(delay)
+    u = rng.normal(size=900) if kind == "white" else np.repeat(rng.normal(size=45), 20)
+    y = lfilter([0] * delay + [1.0], [1, -0.8], u)
+    record = Record.from_arrays(u, y + 0.05 * y.std() * rng.normal(size=900))
+    assert first_significant_lag(record, 0) == delay

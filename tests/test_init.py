@@ -15,11 +15,14 @@ import scipy.io
 import scipy.signal
 from helpers import unfolded
 from test_cli import run
+from test_first_orders import crane
 
+import orthaug as oa
 from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
+from orthaug.data.headers import with_unit
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
 from orthaug.selection import first_orders
@@ -225,6 +228,29 @@ def test_a_delay_is_seen_where_the_response_sets_in_slowly(tmp_path, held):
         "init", tmp_path / "a.csv", "--sampling-time", "0.01", "--out", tmp_path / "spec.toml"
     )
     assert "it is first significant at lag 4" in done.out and ", nk 4;" in done.out
+
+
+def test_the_turning_points_of_an_encoder_are_no_limit(tmp_path):
+    t = np.arange(4000.0)
+    counts = np.round(600 * np.sin(0.004 * t) * np.exp(-t / 4000))
+    clipped = np.clip(counts, None, counts.max() - 100)
+    frame = pd.DataFrame(
+        {"counts": counts, "clipped": clipped, "both": np.tile(counts[:1500], 3)[:4000]}
+    )
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    found = survey(tmp_path / "a.csv")
+    assert np.sum(counts == counts.max()) >= 6
+    assert found.find("counts").limits == () and found.find("both").limits == ()
+    assert found.find("clipped").limits == ((clipped.max(), int(np.sum(clipped == clipped.max()))),)
+
+
+@pytest.mark.parametrize("decimals", [2, 4, None])
+def test_the_rounding_of_a_slow_sine_excites_nothing(decimals):
+    u = 20 + 4 * np.sin(2 * np.pi * np.arange(1500) / 287)
+    u = u if decimals is None else np.round(u, decimals)
+    y = scipy.signal.lfilter([0, 0.2], [1, -0.8], u)
+    record = oa.Record.from_arrays(u, y + 0.01 * np.random.default_rng(0).normal(size=1500))
+    assert first_orders.first_model(record).persistence[0] <= 3
 
 
 def test_what_is_seen_of_a_column(tmp_path):
@@ -433,6 +459,13 @@ def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
     assert "add the others to `files` of `train`" in unfolded(done.err)
 
 
+def test_a_row_of_units_is_right_where_the_header_has_a_remark_in_parentheses():
+    assert split_header(with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
+    assert split_header(with_unit("Kraft (N)", "N")) == ("Kraft", "N")
+    assert split_header(with_unit("Kraft (N)", "")) == ("Kraft", "N")
+    assert split_header(with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
+
+
 def test_units_in_the_row_under_the_header(tmp_path):
     u, y = plant()
     rows = "".join(f"{10 * k},{a:.6f},{b:.6f}\n" for k, (a, b) in enumerate(zip(u, y, strict=True)))
@@ -612,6 +645,31 @@ def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
     assert (
         "# no lag of it is significant, so this is a guess" in (tmp_path / "spec.toml").read_text()
     )
+
+
+def test_a_dead_time_that_the_data_do_not_determine_is_a_guess_in_the_spec(tmp_path):
+    record = crane(0, rows=1600)
+    (one,) = record.experiments
+    columns = {
+        "t": 0.05 * np.arange(1600),
+        "F": one.inputs[:, 0],
+        "pos": one.outputs[:, 0],
+        "swing": one.outputs[:, 1],
+    }
+    pd.DataFrame(columns).to_csv(tmp_path / "a.csv", index=False)
+    roles = ("--inputs", "F", "--outputs", "pos", "swing")
+    done = run("init", tmp_path / "a.csv", *roles, "--out", tmp_path / "spec.toml")
+    assert "several lags of it act together, and the data do not determine" in unfolded(done.out)
+    written = (tmp_path / "spec.toml").read_text(encoding="utf-8")
+    assert "# the data do not determine its first lag, so this is a guess" in written
+
+
+def test_a_free_run_that_diverges_says_so(csv, tmp_path, monkeypatch):
+    monkeypatch.setattr(commands_init, "_LOST", 1e-9)
+    roles = ("--inputs", "force [N]", "--outputs", "position_mm")
+    done = run("init", csv, *roles, "--out", tmp_path / "spec.toml")
+    wanted = "its free run diverges: the error is over 1e-09 times the output's standard deviation"
+    assert f"{wanted} on rows 450 to 600" in unfolded(done.out)
 
 
 def test_the_focus_is_left_to_the_data(tmp_path):
@@ -811,7 +869,7 @@ def test_an_integrator_gets_the_orders_of_runs_that_start_again(tmp_path, monkey
     y = np.cumsum(speed) + 1e-3 * rng.normal(size=1200)
     file = write_columns(tmp_path / "a.csv", u=u, y=y)
     done = run("init", file, "--out", tmp_path / "a.toml")
-    assert done.code == 0 and "orders are the best of runs that start again" in done.out
+    assert done.code == 0 and "the orders come from runs of" in done.out
     assert "y[k-2]" in (tmp_path / "a.toml").read_text()
 
 

@@ -221,8 +221,17 @@ def test_a_time_that_is_missing_is_a_gap(tmp_path):
     assert (record.missing, [len(e) for e in record.experiments]) == (1, [40, 59])
 
 
-def test_single_rows_tell_no_sampling_time(tmp_path):
-    path = write(tmp_path / "run.csv", {k: "" for k in range(0, 100, 2)}, {}, time=range(100))
+def test_single_rows_have_the_sampling_time_of_the_whole_column(tmp_path):
+    time = [0.5 * k for k in range(100)]
+    path = write(tmp_path / "run.csv", {k: "" for k in range(0, 100, 2)}, {}, time=time)
+    record = read(path, time="t")
+    assert (record.sampling_time, record.missing) == (0.5, 50)
+    assert [len(e) for e in record.experiments] == [1] * 50
+    late = [t + (k > 30) for k, t in enumerate(time)]
+    path = write(tmp_path / "late.csv", {k: "" for k in range(0, 100, 2)}, {}, time=late)
+    with pytest.raises(InputError, match="column 't': a step of 1.5 s where 0.5 s is usual"):
+        read(path, time="t")
+    path = write(tmp_path / "gap.csv", {k: "" for k in range(0, 100, 2)}, {}, time=["", *time[1:]])
     with pytest.raises(InputError, match="no two rows without missing cells follow each other"):
         read(path, time="t")
 

@@ -214,6 +214,19 @@ def test_the_command_fits_and_reads_further_data(project):
     assert "Traceback" not in done.err
 
 
+def test_rows_left_out_around_a_slow_sensor_name_the_way_to_keep_them(project):
+    given = SPEC.format(missing="skip")
+    (project / "spec.toml").write_text(given, encoding="utf-8")
+    wanted = ("the longest stretch between missing samples has 1 row", '`missing = "keep"`')
+    one_line(run("check", project / "spec.toml").err, *wanted)
+    lagged = given.split("[motion]")[0] + (
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    )
+    (project / "spec.toml").write_text(lagged, encoding="utf-8")
+    err = run("check", project / "spec.toml").err
+    assert one_line(err, wanted[0]) and "keep" not in err
+
+
 def test_lagged_physics_refuses_to_keep(project):
     lagged = SPEC.format(missing="keep").split("[motion]")[0] + (
         '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthaug import Channel, InputError, open_parquet, read_record
+from orthaug._base.errors import MissingSampleError
 
 CONTENT = "t,u,y\n" + "".join(f"{k / 10},{k},{10 * k}\n" for k in range(10))
 
@@ -213,10 +214,14 @@ def test_a_bad_cell_of_the_time_column(tmp_path):
 
 @pytest.mark.parametrize("content", ["u,y\n1,2\n3,4\n5,\n", "u,y,z\n1,2,\n3,4,\n5,,1\n,,1\n"])
 def test_used_columns_of_unequal_length(tmp_path, content):
-    with pytest.raises(
-        InputError, match="run.csv: .*unequal lengths: 'u' 3, 'y' 2 rows. Give all the same length"
-    ):
+    """In a table they end with empty cells, which rows may leave out; variables are refused."""
+    wanted = (
+        r"run.csv: line 4 \(row 2\), column 'y': the cell is empty, and so are all below it; 'u' "
+        "goes on to row 2; expected a finite number."
+    )
+    with pytest.raises(MissingSampleError, match=wanted):
         read(put(tmp_path, content))
+    assert len(read(put(tmp_path, content), rows=[0, 2])) == 2
     np.savez(tmp_path / "run.npz", u=np.ones(3), y=np.ones(2))
     with pytest.raises(InputError, match="unequal lengths: 'u' 3, 'y' 2 rows"):
         read(tmp_path / "run.npz")
@@ -344,6 +349,10 @@ DATES = [
     (("12/31/2024 23:59:59.5", "12/31/2024 23:59:59.75", "01/01/2025 00:00:00"), 0.25),
     (("03/04/2024 10:00:00", "03/04/2024 10:00:01", "03/04/2024 10:00:02"), 1.0),  # either way
     (("12:00:00.5", "12:00:01.5", "12:00:02.5"), 1.0),
+    (("2025-01-02 11:59:59 AM", "2025-01-02 12:00:00 PM", "2025-01-02 12:00:01 PM"), 1.0),
+    (("01/13/2025 11:59:59 AM", "01/13/2025 12:00:00 PM", "01/13/2025 12:00:01 PM"), 1.0),
+    (("2025-01-02 11:59 PM", "2025-01-03 12:00 AM", "2025-01-03 12:01 AM"), 60.0),
+    (("2025-01-02 11:59:59.5 PM", "2025-01-02 11:59:59.75 PM", "2025-01-03 12:00:00.0 AM"), 0.25),
 ]
 
 

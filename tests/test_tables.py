@@ -13,6 +13,7 @@ import pytest
 from orthaug import InputError
 from orthaug.data import tables
 from orthaug.data.layouts import layout
+from orthaug.data.survey import survey
 from orthaug.data.tables import check_readable, column_names, has_column, read_table
 
 
@@ -126,6 +127,43 @@ def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, 
     assert read_table(path, ("u",)).first_line == above.count("\n") + 2
     path = put(tmp_path, "run.csv", above + "u;y\n1,5;2\n3;4,5\n")
     assert values(path, "u", "y") == [[1.5, 3.0], [2.0, 4.5]]
+
+
+@pytest.mark.parametrize(
+    "above",
+    [
+        "Messung;Stand 4;\n",
+        "Messung 7;;\nDatum: 3.4.2025;;\n;;\n",
+        "Stand;4;\n",
+        "\nMessung\nStand;4;\n",
+    ],
+)
+@pytest.mark.parametrize("units", ["", "[s];[kN];[mm]\n"])
+def test_lines_that_excel_padded_above_the_header_are_no_header(tmp_path, above, units):
+    header = "Zeit;Druck (Luft);Weg\n"
+    path = put(tmp_path, "run.csv", f"{above}{header}{units}0,0;1;2\n0,1;3;4,5\n0,2;;\n")
+    assert column_names(path) == ["Zeit", "Druck (Luft)", "Weg"]
+    assert values(path, "Druck (Luft)", "Weg") == [[1.0, 3.0], [2.0, 4.5]]
+    table = read_table(path, ["Weg"])
+    assert table.first_line == f"{above}{header}{units}".count("\n") + 1
+    assert table.units == ({"Zeit": "s", "Druck (Luft)": "kN", "Weg": "mm"} if units else {})
+
+
+def test_lines_above_the_header_of_a_worksheet(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in ([], ["Messung 7"], ["Stand", 4], [], ["t", "u", "y"], [0, 1, 2], [1, None, 4]):
+        book.active.append(row)
+    book.save(tmp_path / "run.xlsx")
+    assert column_names(tmp_path / "run.xlsx") == ["t", "u", "y"]
+    table = read_table(tmp_path / "run.xlsx", ["t", "y"])
+    assert [table.columns[name].tolist() for name in ("t", "y")] == [[0.0, 1.0], [2.0, 4.0]]
+    assert table.where(0) == "line 6 (row 0)"
+
+
+def test_a_row_of_units_is_not_taken_for_the_header_above_which_a_name_lacks(tmp_path):
+    path = put(tmp_path, "run.csv", "t,,y\ns,V,m\n0,1,2\n1,3,4\n")
+    assert column_names(path) == ["t", "y"]
 
 
 UNITS_UNDER_NAMES = {
@@ -315,7 +353,7 @@ def test_a_row_of_a_file_without_header_is_named_by_its_line(tmp_path):
     assert layout(path).note == "no header, so the columns are called x1 to x2"
     with pytest.raises(
         InputError,
-        match="line 3 has 3 cells and line 1 has 2; is a separator or a decimal comma wr",
+        match="line 3 has 3 cells, line 1 has 2. Correct the line: is a separator or a decimal",
     ):
         read_table(put(tmp_path, "run.dat", "1 2\n3 4\n5 6 7\n"), ["x1"])
 
@@ -570,3 +608,29 @@ def test_a_cut_parquet_file(tmp_path):
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(InputError, match="run.parquet: not a readable Parquet file"):
         read_table(path, ("y",))
+
+
+def test_a_line_with_too_many_cells_is_counted(tmp_path):
+    rows = [f"{k},{k % 3},{k % 5}\n" for k in range(30)]
+    rows[10] = "10,1,0,7,8\n"
+    path = put(tmp_path, "run.csv", "t,u,y\n" + "".join(rows))
+    wanted = "line 12 has 5 cells, the header has 3. Correct the line: is a separator or a decimal"
+    for look in (lambda: read_table(path, ["u"]), lambda: survey(path)):
+        with pytest.raises(InputError, match=wanted):
+            look()
+    rows[10] = rows[20] = "20,1,0,7\n"
+    path = put(tmp_path, "run.csv", "t,u,y\n" + "".join(rows))
+    with pytest.raises(InputError, match="the header has 3; 2 lines have too many"):
+        survey(path)
+
+
+@pytest.mark.parametrize("step", ["0,10", "0,00"])
+def test_decimal_commas_between_commas_are_a_question(tmp_path, step):
+    rows = "".join(f"{k},{k % 10}0,1,5{k},{step}\n" for k in range(30))
+    path = put(tmp_path, "run.csv", "Zeit,Druck,Weg\n" + rows)
+    wanted = (
+        "line 2 has 6 cells under 3 names, and so have most lines. Perhaps the decimals have "
+        "commas, too: export the table with ; as separator"
+    )
+    with pytest.raises(InputError, match=wanted):
+        survey(path)

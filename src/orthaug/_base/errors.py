@@ -130,6 +130,12 @@ class MissingSampleError(InputError):
     code = "sample_missing"
 
 
+class SurplusCellsError(InputError):
+    """A line of a text table has more cells than its header has names."""
+
+    code = "surplus_cells"
+
+
 class RankError(InputError):
     """The physics columns are linearly dependent on the data; names the parameters involved."""
 

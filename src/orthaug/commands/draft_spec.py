@@ -230,10 +230,14 @@ def _baseline(named: tuple[list[str], list[str]], model: FirstModel) -> Any:
     inputs, outputs = named
     terms, orders = [], model.orders
     comments = {}
-    for name, nk, seen in zip(inputs, orders.nk, model.delays, strict=True):
+    for name, nk, seen, unsure in zip(
+        inputs, orders.nk, model.delays, model.undetermined, strict=True
+    ):
         if seen != nk:
             why = (
-                "no lag of it is significant, so this is a guess"
+                "the data do not determine its first lag, so this is a guess"
+                if unsure
+                else "no lag of it is significant, so this is a guess"
                 if seen is None
                 else CLEARLY.format(seen)
             )

@@ -496,8 +496,10 @@ def _account(
         used.add(id(found.clock.faulty))  # the line of the sampling time tells its fault
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
-    for column, delay, order in zip(roles.inputs, model.delays, model.persistence, strict=True):
-        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay)}")
+    for column, delay, order, unsure in zip(
+        roles.inputs, model.delays, model.persistence, model.undetermined, strict=True
+    ):
+        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay, unsure)}")
     if roles.every > 1:
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
@@ -546,7 +548,8 @@ def _account(
         where = f"rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
     shown = ", ".join(percent(error, 3) for error in errors)
     lines.append(
-        f"first physics: {physics}; its free run leaves the outputs on {where}"
+        f"first physics: {physics}; its free run diverges: the error is over {_LOST:g} times the "
+        f"output's standard deviation on {where}"
         if max(errors) > _LOST
         else f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
         f"deviation on {where}"
@@ -554,9 +557,9 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            f"orders are the best of runs that start again every {model.restarted} rows, with an "
-            f"error of {shown}, for longer ones drift on the last {percent(1 - FITTED)} of rows 0 "
-            f"to {cut}"
+            f"the orders come from runs of {model.restarted} rows, each from measured outputs on, "
+            f"since longer runs drift away: their error is {shown} on the last "
+            f"{percent(1 - FITTED)} of rows 0 to {cut}"
         )
     if cut - missing > LOOKED_AT:
         lines.append(
@@ -569,7 +572,12 @@ def _account(
     return "\n".join(lines)
 
 
-def _delay(delay: int | None) -> str:
+def _delay(delay: int | None, undetermined: bool) -> str:
+    if undetermined:
+        return (
+            "several lags of it act together, and the data do not determine the first: a dead "
+            "time is not seen"
+        )
     if delay is None:
         return "no lag of it is significant"
     last = (

@@ -24,6 +24,7 @@ from orthaug.commands.program import (
     Rows,
     Which,
     app,
+    missing_cells,
     out_folder,
     prepare_jax,
     print_result,
@@ -194,6 +195,7 @@ def explain(
         ),
     ] = None,
     most: Annotated[int, typer.Option("--terms", metavar="N", help="Terms at most.")] = 6,
+    missing: Annotated[str | None, missing_cells("as in training, otherwise keep or skip")] = None,
     rows: Rows = None,
     as_json: AsJson = False,
 ) -> None:
@@ -206,7 +208,7 @@ def explain(
     from orthaug.commands.run import explain_model, explain_notes, open_explained, read_rows
     from orthaug.reports.explanation import explain_text
 
-    opened = open_explained(model, data, read_rows(rows))
+    opened = open_explained(model, data, read_rows(rows), missing)
     prepare_jax()
     for line in opened.notes:
         streams.say(line)

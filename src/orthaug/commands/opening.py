@@ -57,9 +57,10 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
     train, validation, tests = parts or load_parts(path, spec)
     with _named(path):
         first, least = physics.rows_needed(spec)
-        train = train.without_short(first, least)
-        validation = validation and validation.without_short(first, least)
-        tests = tuple(part.without_short(first, least) for part in tests)
+        keeps = spec.motion is not None and spec.noise.model == "white"
+        train = train.without_short(first, least, keeps=keeps)
+        validation = validation and validation.without_short(first, least, keeps=keeps)
+        tests = tuple(part.without_short(first, least, keeps=keeps) for part in tests)
         return pose_job(
             path, spec, physics, (train, validation, tests), require_full_rank=require_full_rank
         )

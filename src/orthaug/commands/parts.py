@@ -36,18 +36,25 @@ class FilePart(Part):
     warnings: tuple[Warning, ...] = ()
     """Warnings on rows that were thinned out, or left out around missing samples."""
 
-    def without_short(self, first: int, least: int = 0) -> FilePart:
+    def without_short(self, first: int, least: int = 0, *, keeps: bool = False) -> FilePart:
         """Return the part without stretches between missing samples that are too short.
 
         They have no row after the first `first`.
 
         Args:
             least: minimum rows of a useful stretch.
+            keeps: true if the physics can run through missing outputs.
         """
         if not self.record.missing:
             return self
         record, gaps = long_stretches(
-            self.record, self.skips, first, least, f"data.{self.name}: ", self.skip
+            self.record,
+            self.skips,
+            first,
+            least,
+            f"data.{self.name}: ",
+            self.skip,
+            '`missing = "keep"` in [data] runs through missing outputs' if keeps else "",
         )
         warning = Warning("missing_rows", f"{self.name}: {gaps}")
         return replace(self, record=record, warnings=(*self.warnings, warning))
@@ -83,7 +90,13 @@ class FilePart(Part):
 
 
 def long_stretches(
-    record: Record, skips: Sequence[int], first: int, least: int = 0, what: str = "", skip: int = 0
+    record: Record,
+    skips: Sequence[int],
+    first: int,
+    least: int = 0,
+    what: str = "",
+    skip: int = 0,
+    remedy: str = "",
 ) -> tuple[Record, str]:
     """Return a record without stretches too short to predict a row, and a text on these.
 
@@ -91,6 +104,7 @@ def long_stretches(
         skips: leading samples of each stretch that are not scored.
         least: rows of a stretch that has a use.
         what: prefix of the message; `skip` is the largest of the skips as given.
+        remedy: sentence at the end of the message.
 
     Raises:
         InputError: no stretch is long enough.
@@ -103,7 +117,7 @@ def long_stretches(
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
             f"{record.experiments[0].source}: {what}the longest stretch between missing "
-            f"samples has {plural(most, 'row')}, too few: {needed}."
+            f"samples has {plural(most, 'row')}, too few: {needed}.{remedy and f' {remedy}.'}"
         )
     kept = replace(record, experiments=long)
     usable = sum(len(experiment) - first for experiment in long)

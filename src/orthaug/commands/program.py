@@ -174,14 +174,19 @@ Initial = Annotated[
         show_default="measured",
     ),
 ]
-Missing = Annotated[
-    str,
-    typer.Option(
+
+
+def missing_cells(default: bool | str = True) -> Any:
+    """Return the option `--missing` of a command, with its default in words or as it is."""
+    return typer.Option(
         "--missing",
         metavar="error|skip|keep",
         help="Rows with missing cells: skip leaves them out, keep simulates a motion through them.",
-    ),
-]
+        show_default=default,
+    )
+
+
+Missing = Annotated[str, missing_cells()]
 Rows = Annotated[
     str | None,
     typer.Option("--rows", metavar="A:B", help="Rows of the file, half-open.", show_default="all"),

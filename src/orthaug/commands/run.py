@@ -23,6 +23,8 @@ from orthaug.data.record import Channel, Record
 from orthaug.data.tables import check_readable, has_column
 from orthaug.reports.explanation import ExplainResult
 
+_MISSING = ("error", "skip", "keep")
+
 if TYPE_CHECKING:
     from orthaug.analysis.observed import Consistency
     from orthaug.models.model import Model
@@ -57,7 +59,7 @@ class ReadOptions:
         Raises:
             InputError: an invalid value of an option.
         """
-        check_choice(missing, ("error", "skip", "keep"), "--missing")
+        check_choice(missing, _MISSING, "--missing")
         if every < 1:
             raise InputError(f"--every: found {every}; expected 1 or more.")
         named = {}
@@ -121,20 +123,29 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
     return None
 
 
-def open_explained(model: Path, data: Sequence[Path], rows: tuple[int, int] | None) -> ModelOnData:
+def open_explained(
+    model: Path,
+    data: Sequence[Path],
+    rows: tuple[int, int] | None,
+    missing: str | None = None,
+) -> ModelOnData:
     """Return a model with the files to explain it over.
 
-    Of files that it was trained on, those rows are read where no `rows` are given.
+    Of files that it was trained on, those rows are read where no `rows` are given, and missing
+    cells are treated as then where `missing` does not say how.
 
     Raises:
         InputError: as `open_run`.
     """
+    if missing is not None:
+        check_choice(missing, _MISSING, "--missing")
     opened, notes = [], []
     for path in data:
         check_readable(path)
         trained = trained_reading(model, path)
         reading = trained or ReadOptions("auto", prepare=True)
-        opened.append(open_run(model, path, reading=replace(reading, rows=rows or reading.rows)))
+        reading = replace(reading, rows=rows or reading.rows, missing=missing or reading.missing)
+        opened.append(open_run(model, path, reading=reading))
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
         notes += (
@@ -214,7 +225,9 @@ def open_run(
         # A state to predict from
         estimated = need_outputs and loaded.form.states and not loaded.form.memory
         first = loaded.form.first_row + ahead + bool(estimated)
-        record, text = long_stretches(record, [0] * len(record.experiments), first)
+        keep = "--missing keep runs through missing outputs" if loaded.form.takes_gaps else ""
+        stretches = [0] * len(record.experiments)
+        record, text = long_stretches(record, stretches, first, remedy=keep)
         notes += (f"note: {data}: {text}",)
     begin = 0 if reading.rows is None else int(np.ravel(reading.rows)[0])
     return ModelOnData(loaded, record, data, rows, notes, first_row=begin)

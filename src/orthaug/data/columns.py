@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import keyword
 import re
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +35,7 @@ _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
 _LEVELS = 20  # of a signal at least, for one with fewer is often at its extremes anyway
 _FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
+_RANGE = 100.0  # steps within the range from which on a signal that turns looks rounded
 _COARSE = 0.02  # steps of a signal over its standard deviation that are reported
 SPIKE = 15.0
 """Deviations from its neighbours from which on a sample is a spike."""
@@ -90,7 +93,7 @@ class Column:
     def limits(self) -> tuple[tuple[float, int], ...]:
         """Extreme values that the signal has much more often than others, with the rows.
 
-        Such a signal may be saturated.
+        Such a signal may be saturated. Rows in which a rounded signal turns are not counted.
         """
         levels, counts = np.unique(self.finite, return_counts=True)
         if len(levels) < _LEVELS:
@@ -105,7 +108,14 @@ class Column:
             _OFTEN * float(np.median(counts)),
             _LONGER * float(np.median(held)) if len(held) else 0.0,
         )
-        return tuple((float(levels[i]), int(counts[i])) for i in (0, -1) if counts[i] >= least)
+        found = []
+        for i in (0, -1):
+            rows = int(counts[i])
+            if rows >= least:
+                rows -= _turning_rows(x, edges, float(levels[i]))
+            if rows >= least:
+                found.append((float(levels[i]), rows))
+        return tuple(found)
 
     @property
     def spikes(self) -> int:
@@ -165,6 +175,30 @@ class Column:
         if self.kind or bool(applied) == bool(measured):
             return self.kind
         return "input" if applied else "output"
+
+
+def _turning_rows(x: Vector, edges: Any, level: float) -> int:
+    """Return the rows at an extreme value in which a signal that is rounded to steps q turns.
+
+    A parabola that stays within q for n rows has moved by at most q ((3n − 1)/(n − 1))² n rows
+    before and after. One that runs into a limit has moved farther.
+
+    Args:
+        edges: the rows at which runs of equal values begin, and the number of rows.
+    """
+    step = quantum_of(x)
+    if step is None or np.ptp(x) < _RANGE * step:
+        return 0
+    found = 0
+    for begin, end in itertools.pairwise(edges.tolist()):
+        n = end - begin
+        if n < 2 or x[begin] != level:
+            continue
+        most = step * ((3 * n - 1) / (n - 1)) ** 2
+        around = x[[max(begin - n, 0), min(end - 1 + n, len(x) - 1)]]
+        if (np.abs(around - level) <= most).all():
+            found += n
+    return found
 
 
 def quantum_of(values: Vector) -> float | None:

@@ -37,10 +37,13 @@ _OF_TIME = re.compile(rf"(.+)_({'|'.join([*_PARTS, *_MULTIPLES])})")
 _DATES = {
     ".": ("%d.%m.%Y", "%d.%m.%y"),
     "/": ("%d/%m/%Y", "%m/%d/%Y", "%Y/%m/%d"),
-    "-": ("%d-%m-%Y",),
+    "-": ("%d-%m-%Y", "%Y-%m-%d"),
     ":": ("",),
 }
-_TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p")
+_TIMES = (
+    *("%H:%M:%S.%f", "%H:%M:%S", "%H:%M"),
+    *("%I:%M:%S %p", "%I:%M:%S.%f %p", "%I:%M %p"),
+)
 _MOST_OF = 0.9  # share of the cells that have to be dates
 _COMMA = r"(:\d\d),(\d+)"
 
@@ -69,8 +72,19 @@ def split_header(header: str) -> tuple[str, str]:
 
 
 def with_unit(header: str, unit: str) -> str:
-    """Return a header with the unit that is elsewhere, as under it; one of its own stays."""
-    return f"{header} [{unit}]" if unit and not split_header(header)[1] else header
+    """Return a header with the unit that is elsewhere, as under it; one of its own stays.
+
+    What is in parentheses need not be a unit, as in `force (drive)`: it stays a part of the name.
+    """
+    own = split_header(header)[1]
+    remark = own != unit and header.rstrip().endswith(")")
+    return f"{header} [{unit}]" if unit and (not own or remark) else header
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a cell is a unit: one that is common, or in square brackets."""
+    bare = text.strip()
+    return re.fullmatch(r"\[[^\[\]]*\]", bare) is not None or _UNITS.fullmatch(bare) is not None
 
 
 def last_part(name: str) -> str:

@@ -12,7 +12,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from itertools import islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 from xml.etree.ElementTree import iterparse
@@ -21,11 +21,12 @@ import numpy as np
 
 from orthaug._base.errors import InputError, show
 from orthaug._base.memory import check_memory
+from orthaug.data.headers import is_unit
 
 _REMARK = ("#", "%")  # lines above the header that begin so
 _NUMBER = re.compile(r'[\s"]*[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?[\s"]*')
 _COMMA = re.compile(r"(\d*),(\d+)")
-_DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\dZ?")
+_DATE = re.compile(r"\d[\d.:/+ T-]*[.:/-][\d.:/+ T-]*\d(?:Z| ?[AaPp][Mm])?")
 MISSING = ("", "nan", "na", "n/a", "#n/a", "n.a.", "n.v.", "null", "none", "-", "--")
 """Words of a cell without a sample, in small letters."""
 _NO_UNIT = ("", "-", "--")  # cells of a row of units without one
@@ -100,6 +101,12 @@ class Layout(NamedTuple):
             return False
         with path.open(encoding=self.encoding, newline="") as file:
             return pattern.search("".join(islice(file, self.header_line, None))) is not None
+
+    def count_cells(self, path: Path, line: int) -> int:
+        """Return the number of cells in a line of the file, counted from 1."""
+        with path.open(encoding=self.encoding, newline="") as file:
+            text = next(islice(file, line - 1, None), "")
+        return len(_row(text.rstrip("\r\n"), self.separator))
 
 
 def layout(path: Path, columns: Sequence[str] = ()) -> Layout:
@@ -327,13 +334,41 @@ def _default_names(rows: list[list[str]]) -> list[str]:
 
 
 def _below_remarks(rows: list[tuple[list[str], int]], separator: str) -> tuple[list[str], int]:
-    """Return the first line with as many cells as the rows below, or else the first line."""
+    """Return the first line with as many cells as the rows below, or else the first line.
+
+    Lines above it that were padded to that number with empty cells, as Excel does, are no header.
+    """
+    padded = _below_padding([cells for cells, _ in rows], separator)
+    if padded:
+        return rows[padded]
     for at, (cells, _) in enumerate(rows[1:], start=1):
         if len(cells) > 1 and any(_is_number(cell, separator) for cell in cells):
             count = len(cells)
             above = [one for one in rows[1:at] if _count(one[0]) == count]
             return above[0] if above and len(rows[0][0]) != count else rows[0]
     return rows[0]
+
+
+def _below_padding(rows: list[list[str]], separator: str) -> int:
+    """Return the first row with a name over each column of numbers, 0 where that is the first.
+
+    It is also 0 where there is none, or where that row may hold the units of a header above it.
+    """
+
+    def numbers(row: list[str]) -> set[int]:
+        return {j for j, cell in enumerate(row) if _is_number(cell, separator)}
+
+    held = [numbers(row) for row in rows]
+    start = next((i for i, (a, b) in enumerate(pairwise(held)) if a & b), 0)
+    used = max((max(columns, default=-1) for columns in held[start : start + _BELOW]), default=-1)
+
+    def names_all(row: list[str]) -> bool:
+        return len(row) > used and all(cell.strip() for cell in row[: used + 1])
+
+    if start == 0 or used < 1 or names_all(rows[0]):
+        return 0
+    found = next((i for i in range(1, start) if names_all(rows[i]) and not held[i]), 0)
+    return 0 if sum(map(is_unit, rows[found])) > 0.5 * len(rows[found]) else found
 
 
 def _is_number(cell: str, separator: str) -> bool:
@@ -411,8 +446,9 @@ def read_sheet(path: Path, place: Place) -> tuple[int, list[list[Any]], tuple[st
 
     The cells are those of the columns that `place` finds in the header.
 
-    The first row that holds anything is the header. A row of units may be under it; otherwise there
-    are none. A cell that is not there is None.
+    The first row that holds anything is the header, or the first with a name over each column of
+    numbers. A row of units may be under it; otherwise there are none. A cell that is not there is
+    None.
 
     Raises:
         InputError: no openpyxl, an encrypted file, no worksheet, an empty one, entities, more than
@@ -509,22 +545,24 @@ def _check_strings(sheet: Any) -> None:
 
 
 def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]], tuple[str, ...]]:
-    header, cells, names = 0, [], []
-    begin: list[list[str]] = []  # the first rows, as texts
-    places: Sequence[int] = ()
-    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-        if header:
-            if len(begin) <= _BELOW:
-                begin.append(["" if c is None else c if isinstance(c, str) else "0" for c in row])
-            for column, index in zip(cells, places, strict=True):
-                column.append(row[index] if index < len(row) else None)
-        elif any(cell is not None for cell in row):
-            names = ["" if cell is None else str(cell).strip() for cell in row]
-            header, places = number, place(names)
-            cells = [[] for _ in places]
-    if not header:
+    rows = enumerate(sheet.iter_rows(values_only=True), start=1)
+    filled = ((number, row) for number, row in rows if any(cell is not None for cell in row))
+    first = next(filled, None)
+    if first is None:
         raise InputError(f"{path}: the first worksheet is empty.")
-    units = _units(names, begin, ",")
+    ahead = [first, *islice(rows, _AHEAD)]
+    texts = [
+        ["" if c is None else c if isinstance(c, str) else "0" for c in row] for _, row in ahead
+    ]
+    at = _below_padding(texts, ",")
+    header, titles = ahead[at]
+    names = ["" if cell is None else str(cell).strip() for cell in titles]
+    places = place(names)
+    cells: list[list[Any]] = [[] for _ in places]
+    for _, row in chain(ahead[at + 1 :], rows):
+        for column, index in zip(cells, places, strict=True):
+            column.append(row[index] if index < len(row) else None)
+    units = _units(names, texts[at + 1 : at + 2 + _BELOW], ",")
     return (header + 1, [column[1:] for column in cells], units) if units else (header, cells, ())
 
 

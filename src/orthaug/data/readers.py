@@ -32,6 +32,7 @@ from orthaug.data.record import (
 )
 from orthaug.data.steps import Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
+from orthaug.data.variables import ENDINGS
 
 RowRange = tuple[int, int] | list[int]
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
@@ -105,7 +106,7 @@ def read_record(
         raise InputError("no channels are asked for; name inputs, outputs or both.")
     if fault := thinned_fault(path, sampling_time, every, wanted):
         raise InputError(f"{path}: {fault}")
-    table = _trim(read_table(path, wanted, time or None), uneven=missing != "error")
+    table = _trim(read_table(path, wanted, time or None), gaps=missing != "error")
     needed = wanted
     if missing == "keep":
         needed = [*(column_of[c.name] for c in channels[0]), *([time] if time else [])]
@@ -156,10 +157,7 @@ def read_record(
         )
         return _with_instants(record, table.columns[time], recorded)
     if time and not steps:
-        raise InputError(
-            f"{path}: no two rows without missing cells follow each other; the sampling time "
-            "is unknown."
-        )
+        steps = _steps_of(table, time, ranges)
     step = steps[0] if time else (1.0 if sampling_time is None else float(sampling_time))
     if others := [other for other in steps if not same_step(other, step)]:
         steps_text = f"steps by {step:g} s in one row range and by {others[0]:g} s in another"
@@ -278,15 +276,17 @@ def read_samples(
     return {lag: values[:, j] for j, lag in enumerate(lags)}, weights
 
 
-def _trim(table: Table, *, uneven: bool = False) -> Table:
+def _trim(table: Table, *, gaps: bool = False) -> Table:
     """Return the table without its last rows where every used column is empty.
 
-    Such are blank lines, and the ends of longer unused columns.
+    Such are blank lines, and the ends of longer unused columns. Where `gaps` are refused, so are
+    variables of unequal lengths; a table has empty cells there, which are looked at later.
     """
     longest = max(table.filled.values())
     if longest == 0:
         raise InputError(f"{table.path}: there are no data rows in {', '.join(table.columns)}.")
-    if len(set(table.filled.values())) > 1 and not uneven:
+    gaps = gaps or table.path.suffix.lower() not in ENDINGS
+    if len(set(table.filled.values())) > 1 and not gaps:
         listing = ", ".join(f"'{name}' {length}" for name, length in table.filled.items())
         raise InputError(
             f"{table.path}: the used columns have unequal lengths: {listing} rows. Give all "
@@ -434,7 +434,7 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
         if bad.size:
             row = start + int(bad[0])
             text = table.cell(name, row)
-            what = f"found '{text}'" if text else "the cell is empty"
+            what = f"found '{text}'" if text else f"the cell is empty{_end_of(table, name, row)}"
             error = MissingSampleError if text.strip().lower() in MISSING else InputError
             dated, number = name == table.dated, np.isfinite(text_number(text))
             kind = "a date" if dated else "decimals with commas" if number else ""
@@ -443,6 +443,14 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
                 f"{table.path}: {table.where(row)}, column '{name}': {what}; expected {wanted}."
                 f"{'' if kind or error is MissingSampleError else _remedy(text)}"
             )
+
+
+def _end_of(table: Table, name: str, row: int) -> str:
+    """Return that all cells below an empty one are empty too, where other columns go on."""
+    longest = max(table.filled, key=lambda one: table.filled[one])
+    if row < table.filled[name] or table.filled[name] == table.filled[longest]:
+        return ""
+    return f", and so are all below it; '{longest}' goes on to row {table.filled[longest] - 1}"
 
 
 def _remedy(text: str) -> str:
@@ -484,6 +492,23 @@ def _with_instants(record: Record, instants: Vector, recorded: int) -> Record:
     mean = float(np.mean(np.concatenate([one.steps[:-1] for one in found])))
     missing = recorded - sum(map(len, found))
     return replace(record, experiments=tuple(found), sampling_time=mean, missing=missing)
+
+
+def _steps_of(table: Table, time: str, ranges: Sequence[tuple[int, int]]) -> list[float]:
+    """Return the step of each range by all of its instants, where every other row has gaps.
+
+    Raises:
+        InputError: instants that are missing or uneven.
+    """
+    complete = [
+        (a, b) for a, b in ranges if np.isfinite(table.columns[time][a:b]).all() and b > a + 1
+    ]
+    if not complete:
+        raise InputError(
+            f"{table.path}: no two rows without missing cells follow each other, and column "
+            f"'{time}' has missing cells, too; the sampling time is unknown."
+        )
+    return [_uniform_step(table, time, a, b) for a, b in complete]
 
 
 def _uniform_step(table: Table, time: str, start: int, stop: int) -> float:

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.checks import Vector, nearest
-from orthaug._base.errors import InputError, show
+from orthaug._base.errors import InputError, SurplusCellsError, show
 from orthaug._base.lines import join_words
 from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
-from orthaug.data.headers import split_header
+from orthaug.data.headers import split_header, with_unit
 from orthaug.data.layouts import STATES, numbers_only
 from orthaug.data.tables import read_table, read_titles, reading_note
 from orthaug.data.variables import ENDINGS
@@ -201,11 +201,12 @@ def survey(path: Path) -> Survey:
     table, refused = {}, None
     try:
         table = read_table(path, headers).columns
+    except SurplusCellsError:
+        raise
     except InputError as error:  # one of them cannot be read: each by itself
         refused = error
     for header in headers:
-        base, unit = split_header(header)
-        unit = unit or units.get(header, "")
+        base, unit = split_header(with_unit(header, units.get(header, "")))
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
             unusable = "" if np.isfinite(values).any() else "no numbers"

@@ -5,6 +5,7 @@ Cells that are no numbers are kept, so that messages can name it.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,7 +17,12 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, nearest
-from orthaug._base.errors import InputError, MissingColumnError, MissingFileError
+from orthaug._base.errors import (
+    InputError,
+    MissingColumnError,
+    MissingFileError,
+    SurplusCellsError,
+)
 from orthaug._base.memory import check_memory
 from orthaug._base.plugins import READERS, discover
 from orthaug._base.progress import LOG
@@ -35,6 +41,7 @@ from orthaug.data.variables import ENDINGS, foreign, read_variables, short, vari
 _SMALL = 4_000_000  # bytes of a text file that NumPy reads sooner than pandas is imported
 PLAIN_TEXT = (".txt", ".dat")
 """Endings of text that need not be a table."""
+_LONGER = re.compile(r"Expected \d+ fields in line (\d+), saw")  # of pandas
 _NAMED = 30  # columns that a message lists
 
 
@@ -210,15 +217,7 @@ def _read_text(
     numbers, texts, held = _cells(path, found, [*place.values(), beyond], commas, apart, most)
     extra = np.flatnonzero(np.asarray(held[beyond]))
     if extra.size:
-        under = (
-            f"under {len(header)} headers"
-            if found.headed
-            else f"and line {header_line + 1} has {len(header)}"
-        )
-        raise InputError(
-            f"{path}: line {header_line + 1 + extra[0]} has {len(header) + 1} cells {under}; "
-            "is a separator or a decimal comma wrong?"
-        )
+        raise SurplusCellsError(_surplus(path, found, extra, len(held[beyond])))
     values = {name: np.asarray(numbers[place[name]], dtype=float) for name in columns}
 
     dates = None
@@ -236,6 +235,23 @@ def _read_text(
     dated = time if time and dates is not None else ""
     units = _units_of(header, found.units)
     return Table(path, values, filled, header_line + 1, cell, dated, units)
+
+
+def _surplus(path: Path, found: Layout, rows: np.ndarray, total: int) -> str:
+    """Return which rows have more cells than the header has names, and what may be wrong."""
+    names, line = len(found.names), found.header_line + 1 + int(rows[0])
+    count = max(found.count_cells(path, line), names + 1)
+    if found.separator == "," and 2 * len(rows) > total and found.headed:
+        return (
+            f"{path}: line {line} has {count} cells under {names} names, and so have most lines. "
+            "Perhaps the decimals have commas, too: export the table with ; as separator."
+        )
+    besides = f"; {len(rows)} lines have too many" if len(rows) > 1 else ""
+    first = "the header" if found.headed else f"line {found.header_line + 1}"
+    return (
+        f"{path}: line {line} has {count} cells, {first} has {names}{besides}. "
+        "Correct the line: is a separator or a decimal comma wrong?"
+    )
 
 
 def _cells(
@@ -292,6 +308,10 @@ def _cells(
     except ValueError as error:
         if "found 0" in str(error) or isinstance(error, pd.errors.EmptyDataError):
             raise InputError(f"{path}: there are no data rows below the header.") from None
+        longer = _LONGER.search(str(error))
+        if longer is not None:
+            row = int(longer[1]) - found.header_line - 1
+            raise SurplusCellsError(_surplus(path, found, np.array([row]), row + 1)) from None
         raise InputError(f"{path}: not a readable table ({short(error)}).") from None
     return (
         texts.apply(lambda column: column.map(_comma_number if commas else text_number)),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import Warning
-from orthaug.data.headers import split_header
+from orthaug.data.headers import split_header, with_unit
 from orthaug.data.record import Channel
 from orthaug.data.tables import read_titles
 
@@ -79,8 +79,7 @@ def unit_warnings(path: Path, channels: dict[str, Channel]) -> list[Warning]:
     titles = read_titles(path)
     found = []
     for header in titles.names:
-        base, unit = split_header(header)
-        unit = unit or titles.units.get(header, "")
+        base, unit = split_header(with_unit(header, titles.units.get(header, "")))
         channel = channels.get(header) or channels.get(base)
         if channel is None or not unit or not channel.unit or _plain(unit) == _plain(channel.unit):
             continue

@@ -455,7 +455,9 @@ def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bo
     physics, spec = _physics(linearization, terms, moved) if terms else (None, None)
     share = share if chosen else 0.0
     if terms:
-        named = " and ".join(term.expression for term in terms) if len(terms) < 3 else ""
+        places = len(linearization.places)
+        names = [_placed(term.expression, term.added_to, places) for term in terms]
+        named = " and ".join(names) if len(terms) < 3 else ""
         what = named or f"{len(terms)} terms"
         verb = "explains" if len(terms) == 1 else "explain"
         text = f"{what} {verb} {percent(share, 3)} of what the learner adds beside the physics."
@@ -474,6 +476,11 @@ def _explanation(space: Space, chosen: list[Candidate], fitted: Fit, dropped: bo
     )
 
 
+def _placed(expression: str, added_to: str, places: int) -> str:
+    """Return a term with the equation that it is added to, where there are several of them."""
+    return expression if places == 1 else f"{expression} in {added_to}"
+
+
 def _why_nothing(
     space: Space, real: bool, dropped: bool, share: float, singles: Sequence[SingleTerm]
 ) -> str:
@@ -489,9 +496,8 @@ def _why_nothing(
             "what the learner adds is not significant against its own errors; there is nothing "
             "to explain."
         )
-    best = (
-        f"the best single term, {singles[0].expression}, explains {percent(singles[0].share)} of it"
-    )
+    best = _placed(singles[0].expression, singles[0].added_to, len(space.linearization.places))
+    best = f"the best single term, {best}, explains {percent(singles[0].share)} of it"
     if dropped and share < _HALF:
         return f"no term is significant against the learner's own errors; {best}. Keep the learner."
     return (

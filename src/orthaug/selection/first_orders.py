@@ -9,7 +9,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
+from orthaug.data.columns import quantum_of
 from orthaug.data.record import Experiment, Record
 from orthaug.data.sources import RecordSource, witness
 from orthaug.selection.linear_runs import (
@@ -33,11 +34,17 @@ _AS_GOOD = 1.05  # free-run error over the best, up to which fewer lags are take
 _BETTER = 1.2
 PERSISTENCE = 20  # the highest order of excitation that is looked for
 _EXCITED = 1e-6  # singular value over the largest
+_FINE = 0.01  # steps of an input over its deviation, below which they are those of the recording
+_PLACES = 9  # decimals that a recording may have been rounded to
+_ROUNDED = 3.0  # times the singular value that the rounding of a recording has by itself
 _EXACT = 1e-4  # of the output's deviation: below, more lags follow the rounding
 MOST_DELAY = 20
 """The largest delay that is looked for."""
 _PER_DELAY = 6  # rows of the longest experiment at least
 _SURE = 3.1  # standard errors: 5 % for 21 lags together
+# Standard deviations of χ² that lags before the first significant one may explain beside it; fewer
+# where the input excites less than the lags that are tested, which then replace each other
+_EARLIER, _EARLIER_SMOOTH = 5.0, 2.0
 _LEVEL = 0.1  # mean over standard deviation, from which on a constant is part of the physics
 _TELLING = 0.7  # error over the output's deviation, from which on a free run ranks no orders
 # Error over the output's deviation, below which a run may correct the test of the first lag: of a
@@ -63,8 +70,11 @@ class FirstModel:
     offset: bool
     """True if the signals have a level, so that the physics needs a constant."""
     delays: tuple[int | None, ...]
-    """First lag of each input that is significant beside the output's own past; None where none is.
-    """
+    """First lag of each input that is significant beside the output's own past.
+
+    None where none is, or where the data do not determine it."""
+    undetermined: tuple[bool, ...]
+    """Whether several lags of an input act, and the data do not determine the first of them."""
     persistence: tuple[int, ...]
     """Up to which order each input excites; `PERSISTENCE` means that or more."""
     free_run: tuple[float, ...]
@@ -93,7 +103,9 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     record = _spread_windows(record)
     signals = np.concatenate([np.hstack([e.outputs, e.inputs]) for e in record.experiments])
     offset = bool((np.abs(signals.mean(axis=0)) > _LEVEL * signals.std(axis=0)).any())
-    delays = tuple(first_significant_lag(record, i) for i in range(len(record.inputs)))
+    lags = [_first_lag(record, i) for i in range(len(record.inputs))]
+    delays = tuple(lag for lag, _ in lags)
+    undetermined = tuple(unsure for _, unsure in lags)
     excited = tuple(_persistence(record, i) for i in range(len(record.inputs)))
     usual = [tuple(late if delay is None else delay for delay in delays) for late in (1, 0)]
     first_lags = [*usual, *((late,) * len(delays) for late in (1, 0))]
@@ -118,7 +130,9 @@ def first_model(record: Record, *, direct: bool = True) -> FirstModel | None:
     if chosen is None:
         return None
     across, chosen = _coupled(record, excited, chosen, restarted)
-    return FirstModel(chosen[1], offset, delays, excited, chosen[2], restarted, across)
+    return FirstModel(
+        chosen[1], offset, delays, undetermined, excited, chosen[2], restarted, across
+    )
 
 
 def restarted_error(record: Record, model: FirstModel, length: int) -> float:
@@ -368,11 +382,18 @@ def first_significant_lag(record: Record, number: int) -> int | None:
     """Return the first lag of an input with an effect beside past outputs and all other lags.
 
     Where rows or excitation do not allow that, by the cross-correlation with the input made white;
-    where none is significant, by that of the input's square.
+    where none is significant, by that of the input's square. None where lags before it act, too,
+    but none of them by itself, as those of a smooth input: then the data do not determine it.
     """
-    record = _spread_windows(record)
+    return _first_lag(_spread_windows(record), number)[0]
+
+
+def _first_lag(record: Record, number: int) -> tuple[int | None, bool]:
+    """Return the first significant lag of an input, and whether the data do not determine it."""
     longest = max(map(len, record.experiments))
-    found, most = [], max(MOST_LAGS, min(MOST_DELAY, longest // _PER_DELAY))
+    found: list[int | None] = []
+    undetermined = False
+    most = max(MOST_LAGS, min(MOST_DELAY, longest // _PER_DELAY))
     long = tuple(e for e in record.experiments if len(e) > 2 * most)
     for j, output in enumerate(record.outputs if long else ()):
         one = tuple(replace(e, outputs=e.outputs[:, [j]]) for e in long)
@@ -381,8 +402,48 @@ def first_significant_lag(record: Record, number: int) -> int | None:
         found.append(correlated_delay(own, number, most) if tested is None else tested)
         if found[-1] is None:  # an even function of an input has no linear correlation with it
             found[-1] = correlated_delay(own, number, most, squared=True)
+        elif _earlier_lags_act(own, number, most, found[-1]):
+            found[-1], undetermined = None, True
     seen = [lag for lag in found if lag is not None]
-    return min(seen) if seen else None
+    if undetermined and min(seen, default=2) > 1:
+        return None, True
+    return (min(seen) if seen else None), False
+
+
+def _earlier_lags_act(record: Record, number: int, most: int, lag: int) -> bool:
+    """Return whether the lags before one together explain more beside it than by chance.
+
+    The lag is then no dead time, though none of the others is significant by itself.
+    """
+    if lag < 2:
+        return False
+    regression = _regression(record, most)
+    if regression is None:
+        return False
+    phi, y = regression
+    begin = MOST_LAGS + number * (most + 1)
+    earlier = np.arange(begin, begin + lag)
+    q, _ = np.linalg.qr(np.hstack([np.delete(phi, earlier, axis=1), phi[:, earlier]]))
+    parts = q.T @ y
+    variance = (float(y @ y) - float(parts @ parts)) / (len(y) - len(parts))
+    explained = float(parts[-lag:] @ parts[-lag:])
+    smooth = _persistence(record, number) < min(PERSISTENCE, most + 1)
+    surely = _EARLIER_SMOOTH if smooth else _EARLIER
+    return explained > variance * (lag + surely * np.sqrt(2 * lag))
+
+
+def _regression(record: Record, most: int) -> tuple[Matrix, Vector] | None:
+    """Return the output's own lags and those of all inputs, of norm 1, and the output.
+
+    None where rows or excitation do not separate the lags.
+    """
+    orders = Orders(MOST_LAGS, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
+    rows = OutputRows(record.experiments, 0, orders)
+    phi, y = np.concatenate(rows.lags), rows.target
+    phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    if len(y) < 2 * orders.size or np.linalg.cond(phi) > 1 / RANK:
+        return None
+    return phi, y
 
 
 def _tested_delay(record: Record, number: int, most: int) -> int | None:
@@ -390,12 +451,11 @@ def _tested_delay(record: Record, number: int, most: int) -> int | None:
 
     None where none is significant or the lags cannot be separated.
     """
-    orders = Orders(MOST_LAGS, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
-    rows = OutputRows(record.experiments, 0, orders)
-    phi, y = np.concatenate(rows.lags), rows.target
-    q, r = np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))
-    if len(y) < 2 * orders.size or np.linalg.cond(r) > 1 / RANK:
+    regression = _regression(record, most)
+    if regression is None:
         return None
+    phi, y = regression
+    q, r = np.linalg.qr(phi)
     theta = np.linalg.solve(r, q.T @ y)
     noise = float(np.linalg.norm(y - q @ (r @ theta))) / np.sqrt(len(y) - len(theta))
     std = noise * np.linalg.norm(np.linalg.inv(r), axis=1)
@@ -406,14 +466,30 @@ def _tested_delay(record: Record, number: int, most: int) -> int | None:
 
 
 def _persistence(record: Record, number: int) -> int:
-    """Return the rank of the matrix of an input's lags, its mean removed."""
+    """Return the rank of the matrix of an input's lags, its mean removed.
+
+    What the rounding of fine steps adds does not count: it excites no output.
+    """
     longest = max(record.experiments, key=len).inputs[:, number]
     n = min(PERSISTENCE, len(longest) // 3)
     if n < 1:
         return 1
     lagged = np.lib.stride_tricks.sliding_window_view(longest - longest.mean(), n)
     values = np.linalg.svd(np.linalg.qr(lagged, mode="r"), compute_uv=False)
-    return int((values > _EXCITED * values[0]).sum()) if values[0] > 0 else 0
+    step = quantum_of(longest) or _decimal_step(longest)
+    fine = step < _FINE * float(longest.std())
+    rounding = _ROUNDED * step * np.sqrt(len(lagged) / 12) if fine else 0.0
+    return int((values > max(_EXCITED * values[0], rounding)).sum()) if values[0] > 0 else 0
+
+
+def _decimal_step(values: Vector) -> float:
+    """Return the power of ten that all values are multiples of; 0 where none is seen."""
+    steps = (10.0**-places for places in range(_PLACES + 1))
+    exact = 1e-12 * float(np.abs(values).max())
+    return next(
+        (one for one in steps if (np.abs(values - one * np.round(values / one)) <= exact).all()),
+        0.0,
+    )
 
 
 def _errors(
