@@ -238,8 +238,9 @@ class KeptPrograms:
             (size,) = struct.unpack_from("<I", kept)
             result = json.loads(kept[4 : 4 + size])
             exported = export.deserialize(bytearray(kept[4 + size :]))
-        options: Any = {} if effort is None else {"compiler_options": dict(effort)}
-        return Program(jax.jit(exported.call, **options), result)
+        # Its results are committed to their device, and `jit` would compile anew for these
+        lowered = jax.jit(exported.call).lower(*call.arrays)
+        return Program(lowered.compile(None if effort is None else dict(effort)), result)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
