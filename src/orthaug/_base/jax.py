@@ -118,7 +118,7 @@ class _Compiled:
         functools.update_wrapper(self, function)
         self._function, self._effort, self._options = function, effort, options
         self._lock = threading.Lock()
-        named = "<locals>" not in function.__qualname__
+        named = "<" not in getattr(function, "__qualname__", "<")  # objects have no name
         self._may_be_kept = named and options.keys() <= {"static_argnames", "static_argnums"}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

@@ -151,6 +151,8 @@ class MissingTermResult(Content):
     `equation` is None of one of an `output`, and of one that acts as the input `beside` does.
     """
 
+    absent = frozenset({"beside"})
+
     equation: str | None
     output: str | None = None
     beside: str | None = None
