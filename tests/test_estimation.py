@@ -16,6 +16,7 @@ from orthaug import (
     MLP,
     AdamLBFGS,
     Additive,
+    Auto,
     Baseline,
     Channel,
     Function,
@@ -26,6 +27,7 @@ from orthaug import (
     Parameter,
     RankError,
     Record,
+    Simulation,
     Term,
     estimate,
     orthogonalize,
@@ -120,15 +122,35 @@ def short(record):
         ({"lags": (2, 1)}, "`lags` must be"),
         ({"learner": "mlp"}, "`learner` must be"),
         ({"learner": MLP}, "`learner` must be"),
-        ({"structure": "orthogonal"}, "`structure` must be"),
+        ({"structure": "orthogonl"}, "unknown structure 'orthogonl', did you mean 'orthogonal'"),
+        ({"criterion": "simulate"}, "unknown criterion 'simulate', did you mean 'simulation'"),
+        ({"criterion": 5}, r"`criterion` must be Prediction\(…\), Simulation\(…\) or Auto"),
         ({"structure": Additive}, "`structure` must be"),
-        ({"solver": "adam"}, "`solver` must be"),
+        ({"solver": "adam"}, "unknown solver 'adam', did you mean 'adam-lbfgs'"),
+        ({"solver": 3}, "`solver` must be"),
         ({"initial": np.zeros(2)}, "`initial` must be"),
     ],
 )
 def test_arguments_refused(record, arguments, message):
     with pytest.raises(InputError, match=message):
         estimate(record, PHYSICS, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("names", "declared"),
+    [
+        ({"structure": "additive"}, {"structure": Additive()}),
+        ({"criterion": "simulation"}, {"criterion": Simulation()}),
+        ({"criterion": "auto", "structure": "orthogonal"}, {"criterion": Auto()}),
+        ({"solver": "levenberg-marquardt"}, {"solver": LevenbergMarquardt()}),
+    ],
+)
+def test_names_of_a_spec_stand_for_declarations(record, names, declared):
+    few = {"learner": NETWORK, "solver": LevenbergMarquardt(iterations=3)}
+    by_name, by_object = (estimate(record, PHYSICS, **(few | given)) for given in (names, declared))
+    assert by_name.criterion == by_object.criterion
+    assert by_name.model.structure == by_object.model.structure
+    np.testing.assert_array_equal(by_name.theta, by_object.theta)
 
 
 @pytest.mark.parametrize("arguments", [(np.ones((9, 2)), PHYSICS), (record_of(rows=9), ["y[k-1]"])])

@@ -145,6 +145,11 @@ def test_linear_physics_is_the_system_of_python_control(linear):
         assert pole.damping == pytest.approx(dampings[i], rel=1e-10)
 
 
+def test_a_view_counts_its_parts_in_words(pendulum):
+    shown = repr(oa.linearize(pendulum)[0])
+    assert ": 2 states, 1 input, 1 output, 2 poles)" in shown
+
+
 def test_the_entries_of_physics_alone_have_the_intervals_of_theta(linear):
     view = oa.linearize(linear.model)[0]
     columns = {name: i for i, name in enumerate((*view.states, "u", "w"))}

@@ -168,6 +168,12 @@ def test_the_overview_has_run_residual_parameters_and_learned_part(fit, record):
         "learned part of x [m]",
     ]
     figure.canvas.draw()
+    same = [axis.get_title() or axis.get_ylabel() for axis in oa.plot(fit).axes]
+    assert same == shown
+    (axis,) = oa.plot(fit, "learned").axes
+    assert axis.get_ylabel() == "learned part of x [m]"
+    with pytest.raises(oa.InputError, match="`kind` must be one of overview, bode, free_run"):
+        oa.plot(fit, "output")
 
 
 def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):

@@ -259,3 +259,11 @@ def test_designs_are_refused_past_the_limits():
             )
             >= 12
         )
+
+
+def test_a_misspelt_name_is_answered_with_the_nearest():
+    with pytest.raises(AttributeError, match="orthaug has no 'estmate', did you mean 'estimate'"):
+        oa.estmate  # noqa: B018
+    with pytest.raises(AttributeError, match="orthaug has no 'qqq'"):
+        oa.qqq  # noqa: B018
+    assert not hasattr(oa, "__wrapped__")

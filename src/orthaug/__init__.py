@@ -59,4 +59,12 @@ def _progress() -> Any:
 MAKERS.update(html=_html, plot=_plot, report=_report, progress=_progress)
 MAKERS.update(diagnose=_diagnose, findings=_findings)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__ or name.startswith("_"):
+        return _load(name)
+    from orthaug._base.checks import nearest
+
+    raise AttributeError(f"orthaug has no '{name}'{nearest(name, __all__) or '.'}")

@@ -16,6 +16,7 @@ from jaxtyping import Complex, Float
 
 from orthaug._base.checks import Matrix, Vector, check_choice
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import plural
 from orthaug.analysis.linear_system import Continuous, System
 from orthaug.analysis.measured_response import MeasuredResponse
 from orthaug.analysis.operating_points import OperatingPoint
@@ -218,10 +219,8 @@ class LinearView:
 
     def __repr__(self) -> str:
         n, (ny, nu) = self.system.states, self.d.shape
-        return (
-            f"LinearView({self.point}: {n} states, {nu} inputs, {ny} outputs, "
-            f"{len(self.poles)} poles)"
-        )
+        sizes = {"state": n, "input": nu, "output": ny, "pole": len(self.poles)}
+        return f"LinearView({self.point}: {', '.join(plural(k, w) for w, k in sizes.items())})"
 
 
 def log_intervals(

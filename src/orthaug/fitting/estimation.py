@@ -28,7 +28,7 @@ from orthaug.fitting.fit_plans import (
     plan_of,
     rows_in_memory,
 )
-from orthaug.fitting.kinds import Solver
+from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver, declared_by_name
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import PlannedRun
 from orthaug.fitting.motion_estimate import MotionEstimate
@@ -60,9 +60,9 @@ class Options(TypedDict, total=False):
 
     lags: Lags | None
     learner: Learner | None
-    structure: Structure
-    criterion: Criterion | None
-    solver: Solver
+    structure: Structure | str
+    criterion: Criterion | str | None
+    solver: Solver | str
     regularization: Regularization | Sequence[Regularization]
     restarts: int
     seed: int
@@ -93,9 +93,9 @@ def estimate(
     *,
     lags: Lags | None = None,
     learner: Learner | None = MLP(),  # noqa: B008  (frozen)
-    structure: Structure = Orthogonal(),  # noqa: B008  (frozen)
-    criterion: Criterion | None = None,
-    solver: Solver = LevenbergMarquardt(),  # noqa: B008  (frozen)
+    structure: Structure | str = Orthogonal(),  # noqa: B008  (frozen)
+    criterion: Criterion | str | None = None,
+    solver: Solver | str = LevenbergMarquardt(),  # noqa: B008  (frozen)
     regularization: Regularization | Sequence[Regularization] = "auto",
     restarts: int = 1,
     seed: int = 0,
@@ -126,6 +126,8 @@ def estimate(
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
+            Structure, criterion and solver may be names as in a spec, such as "orthogonal",
+            "simulation" and "adam-lbfgs", which stand for their defaults.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
             free run: then θ is trained with the weights and split off at the end (F2). A motion
             takes the latter, by default without washout.
@@ -234,6 +236,8 @@ def fit(problem: Problem | MotionProblem, **options: Any) -> Estimate:
         InputError: as `estimate`.
     """
     plan = plan_of(problem, _checked(Request(**options)))
+    if isinstance(plan.request.criterion, str):
+        plan = plan.on(replace(plan.request, criterion=plan.asked))
     plan.check()
     made = plan.by_other_fits(fit)
     made = _fit_once(plan) if made is None else made
@@ -243,10 +247,13 @@ def fit(problem: Problem | MotionProblem, **options: Any) -> Estimate:
 
 def _checked(request: Request) -> Request:
     """Return a request whose values are of the right types."""
+    structure = declared_by_name(STRUCTURES, request.structure)
+    solver = declared_by_name(SOLVERS, request.solver)
+    request = replace(request, structure=structure, solver=solver)
     check_types(learner=request.learner, structure=request.structure, solver=request.solver)
     check_types(initial=request.initial, validation=request.validation)
     if request.criterion is not None:
-        check_types(criterion=request.criterion)
+        check_types(criterion=declared_by_name(CRITERIA, request.criterion))
     return replace(request, learner=declared(request.learner))
 
 

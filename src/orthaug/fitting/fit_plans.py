@@ -33,7 +33,7 @@ from orthaug.fitting.innovations import (
     predicted_problem,
     stable_or_white,
 )
-from orthaug.fitting.kinds import Solver
+from orthaug.fitting.kinds import CRITERIA, Solver, declared_by_name
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import Task
 from orthaug.fitting.motion_task import MotionTask
@@ -67,11 +67,14 @@ Fit = Callable[..., Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Request:
-    """The options of `fit`, as of `estimate`; `criterion` None for that of the kind of physics."""
+    """The options of `fit`, as of `estimate`; `criterion` None for that of the kind of physics.
+
+    A criterion may be a name.
+    """
 
     learner: Learner | None = MLP()  # noqa: RUF009  (frozen)
     structure: Structure = Orthogonal()  # noqa: RUF009  (frozen)
-    criterion: Criterion | None = None
+    criterion: Criterion | str | None = None
     solver: Solver = LevenbergMarquardt()  # noqa: RUF009  (frozen)
     regularization: Regularization | Sequence[Regularization] = "auto"
     restarts: int = 1
@@ -136,7 +139,9 @@ class FitPlan(ABC, Generic[P]):
     @property
     def asked(self) -> Criterion:
         """The criterion that was asked for, or that of the kind of physics."""
-        return self.criterion if self.request.criterion is None else self.request.criterion
+        given = self.request.criterion
+        own = given is None or given == CRITERIA.kind_of(self.criterion)
+        return self.criterion if own else declared_by_name(CRITERIA, given)
 
     @classmethod
     @abstractmethod
@@ -531,7 +536,7 @@ _TYPES: dict[str, tuple[Any, str]] = {
     "lags": (Lags | None, "Lags(…) or None"),
     "learner": (Learner | None, "a learner such as MLP(), or None"),
     "structure": (Structure, "a structure such as Orthogonal()"),
-    "criterion": (Criterion, "Prediction(…) or Simulation(…)"),
+    "criterion": (Criterion, "Prediction(…), Simulation(…) or Auto(…)"),
     "solver": (Solver, "a solver such as LevenbergMarquardt()"),
     "initial": (Model | None, "a Model or None"),
     "validation": (Record | None, "a Record or None"),

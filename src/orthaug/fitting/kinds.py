@@ -66,3 +66,12 @@ SOLVERS = Registry(
     reserved=_BESIDE,
     beside=CRITERIA,
 )
+
+
+def declared_by_name(registry: Registry, given: Any) -> Any:
+    """Return a declaration, of a name that of its kind with the defaults.
+
+    Raises:
+        InputError: an unknown name, or a kind that needs more than its name.
+    """
+    return registry.discover().declare(given, {}) if isinstance(given, str) else given

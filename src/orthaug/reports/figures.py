@@ -43,7 +43,7 @@ _LEAST_SPAN = 1e-300
 
 
 def plot(
-    what: Response | Linearization | Recursive | FitResult | CheckResult | CompareResult,
+    what: Response | Linearization | Recursive | Estimate | FitResult | CheckResult | CompareResult,
     kind: str | None = None,
     *,
     title: str | None = None,
@@ -53,9 +53,11 @@ def plot(
 
     Args:
         what: a response, of `model.simulate` or `model.predict`; what `linearize` returns; a
-            `Recursive`, for θ over time; or the `result` of `fit_spec` or `compare`.
+            `Recursive`, for θ over time; a fit, for the overview of `fit.plot()`; or the `result`
+            of `fit_spec` or `compare`.
         kind: of a response "output" (measured and model; the default), "residual" or "components"
-            (physics and learner); of linear views "bode" (the default) or "poles". A result has one
+            (physics and learner); of linear views "bode" (the default) or "poles"; of a fit
+            "overview" (the default) or a figure of `fit.plot`, such as "learned". A result has one
             figure: the biases by suspected terms of a fit, or the comparison.
         title: of the figure of a response or of a `Recursive`; by default what kind it is.
         path: PNG file to write; a file of that name is replaced.
@@ -65,16 +67,17 @@ def plot(
             path that cannot be written.
     """
     wanted = (
-        "a Response, such as model.simulate(record), what linearize gives, a Recursive, or the "
-        "`result` of fit_spec or compare"
+        "a Response, such as model.simulate(record), what linearize gives, a Recursive, a fit, or "
+        "the `result` of fit_spec or compare"
     )
     check_type(
         what,
-        Response | Linearization | Recursive | FitResult | CheckResult | CompareResult,
+        Response | Linearization | Recursive | Estimate | FitResult | CheckResult | CompareResult,
         "what",
         wanted,
     )
     kinds = _OF_VIEWS if isinstance(what, Linearization) else _OF_RESPONSES
+    kinds = ("overview", *dir(FitPlots(what))) if isinstance(what, Estimate) else kinds
     kind = check_choice(kinds[0] if kind is None else kind, kinds, "`kind`")
     check_type(title, str | None, "title", "text")
     check_type(path, str | os.PathLike | None, "path", "a file's name")
@@ -94,6 +97,8 @@ def plot(
 def _draw(what: Any, kind: str, title: str | None) -> Figure:
     from orthaug.reports import finding_plots, linear_plots, plots
 
+    if isinstance(what, Estimate):
+        return _draw_fit(FitPlots(what), kind)
     if isinstance(what, Linearization):
         if kind == "bode" and not what[0].inputs:
             raise InputError(
@@ -122,6 +127,15 @@ def _draw(what: Any, kind: str, title: str | None) -> Figure:
         "components": plots.components_figure,
     }
     return draw[kind](what, horizon if title is None else title)
+
+
+def _draw_fit(plots: FitPlots, kind: str) -> Figure:
+    """Return the overview of a fit, or one of its figures."""
+    if kind == "overview":
+        return plots()
+    figure = getattr(plots, kind)().get_figure(root=True)
+    assert figure is not None
+    return figure
 
 
 @dataclass(frozen=True)
