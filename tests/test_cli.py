@@ -746,7 +746,10 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     "missing column": (data(ROWS, "u,position"), ["run.csv", "no column 'y'", "'position'"]),
     "unequal lengths": (
         data(ROWS + "1,\n"),
-        ["run.csv", "line 22 (row 20)", "'y': the cell is empty", "'u' goes on to row 20"],
+        [
+            *("run.csv", "line 22 (row 20)", "'y': the cell is empty", "'u' goes on to row 20"),
+            '`missing = "skip"` in [data] leaves such rows out.',
+        ],
     ),
     "NaN cell": (
         data(ROWS + "1,NaN\n3,4\n"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import jax
@@ -659,6 +660,10 @@ def test_summary(fit):
         np.testing.assert_allclose(float(printed[1]), value, atol=std / 20)
         np.testing.assert_allclose(float(printed[2]), std, rtol=0.05)
     assert len(max(text.splitlines(), key=len)) < 170
+    counted = "The intervals count noise only. `fit.diagnose()` tests whether something is missing"
+    assert counted in unfolded(text) and callable(fit.diagnose)
+    bare = dataclasses.replace(fit, covariance=None)
+    assert "noise only" not in bare.summary()
 
 
 def test_repr(record, fit):

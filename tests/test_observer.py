@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 from test_cli import finite_json, one_line, run
 from test_export import lagged, moving
 from test_missing import SPEC, write
@@ -587,6 +588,31 @@ def test_a_saved_model_carries_the_verdict(fitted, tmp_path):
     assert oa.load(tmp_path / "model").statistics.verdict == model.statistics.verdict != ""
 
 
+def test_the_band_of_an_observer_that_takes_coloured_errors_for_white_says_so(tmp_path):
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=800)
+    e = scipy.signal.lfilter([1], [1, -0.9], 0.1 * rng.normal(size=800))
+    y = np.zeros(800)
+    for k in range(1, 800):
+        y[k] = 0.5 * y[k - 1] + u[k - 1] + e[k]
+    lines = [f"{a:.6f},{b:.6f}" for a, b in zip(u, y, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["u,y", *lines]), encoding="utf-8")
+    (tmp_path / "plant.toml").write_text(
+        '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\n'
+        'train.files = ["run.csv"]\n'
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+        '[[baseline.terms]]\nparameter = "b"\nregressor = "u[k-1]"\n'
+        '[noise]\nmodel = "arma"\nar = 1\nma = 0\n',
+        encoding="utf-8",
+    )
+    done = run("fit", tmp_path / "plant.toml", "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    given = ("predict", tmp_path / "out", tmp_path / "run.csv", "--observer")
+    done = run(*given, "--out", tmp_path / "a.csv")
+    wanted = "the observer takes errors for white that the fitted noise model says are coloured"
+    assert f"as one of 95 %: {wanted}. Predictions without --observer use the noise" in done.err
+
+
 def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_path):
     done = run(
         "predict",
@@ -600,9 +626,9 @@ def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_pa
     )
     assert one_line(
         done.err.splitlines()[-1] + "\n",
-        "note: the squared innovations are",
+        "note: one step ahead, the squared innovations are",
         "(NIS; ",
-        "Its 95 % band contains 9",
+        "Its 95 % band 2 steps ahead contains 9",
     )
     model = oa.load(fitted / "out")
     small = replace(
@@ -625,3 +651,9 @@ def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_pa
         f"Its 95 % band contains {percent(inside[there].mean(), 3)} of the measured values"
         in done.err
     )
+    given = ("predict", tmp_path / "model", fitted / "run.csv", "--observer", "--horizon", "4")
+    done = run(*given, "--out", tmp_path / "c.csv")
+    assert "warning: one step ahead, the squared innovations are" in done.err
+    assert "Its 95 % band 4 steps ahead contains" in done.err
+    assert "For one step, its noises are too small" in done.err
+    assert "For 4 steps, the band is too narrow. oa.Observer" in done.err

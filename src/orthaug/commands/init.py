@@ -557,9 +557,9 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            f"the orders come from runs of {model.restarted} rows, each from measured outputs on, "
-            f"since longer runs drift away: their error is {shown} on the last "
-            f"{percent(1 - FITTED)} of rows 0 to {cut}"
+            f"longer runs drift away, so the orders come from runs of {model.restarted} rows, each "
+            f"from measured outputs on. Their error is {shown} on the last {percent(1 - FITTED)} "
+            f"of rows 0 to {cut}"
         )
     if cut - missing > LOOKED_AT:
         lines.append(

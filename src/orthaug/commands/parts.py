@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.errors import InputError, Warning
+from orthaug._base.errors import InputError, MissingSampleError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.lines import plural
 from orthaug._base.memory import few_arenas
@@ -204,14 +204,21 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
         fault = thinned_fault(path.parent / file, spec.data.sampling_time, part.every, used)
         if fault:
             raise InputError(f"{path}: data.{name}: {fault}")
-        record = read_record(
-            path.parent / file,
-            **_options(spec, part),
-            rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
-            every=part.every,
-            prepare=spec.data.steps,
-            uneven=spec.declared_physics.takes_uneven_rows,
-        )
+        try:
+            record = read_record(
+                path.parent / file,
+                **_options(spec, part),
+                rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
+                every=part.every,
+                prepare=spec.data.steps,
+                uneven=spec.declared_physics.takes_uneven_rows,
+            )
+        except MissingSampleError as error:
+            if spec.data.steps:  # whose message has the remedy
+                raise
+            keep = ', "keep" runs a motion through missing outputs' if spec.motion else ""
+            remedy = f'`missing = "skip"` in [data] leaves such rows out{keep}.'
+            raise MissingSampleError(f"{error} {remedy}") from None
         results.append(
             FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))
         )

@@ -24,6 +24,7 @@ from orthaug.data.tables import check_readable, has_column
 from orthaug.reports.explanation import ExplainResult
 
 _MISSING = ("error", "skip", "keep")
+_WIDE, _NARROW = 0.985, 0.9  # share of the values in a band of 95 %, from which on it is wrong
 
 if TYPE_CHECKING:
     from orthaug.analysis.observed import Consistency
@@ -419,13 +420,18 @@ def observe_outputs(opened: ModelOnData, horizon: int) -> tuple[Response, list[s
 
     observer = Observer(opened.model)
     response = observer.predict(opened.record, horizon=horizon)
-    return response, _of_band(observer.run(opened.record).consistency(), response)
+    consistency = observer.run(opened.record).consistency()
+    coloured = opened.model.coloured
+    return response, _of_band(consistency, response, horizon, coloured=coloured)
 
 
-def _of_band(found: Consistency, response: Response) -> list[str]:
+def _of_band(
+    found: Consistency, response: Response, horizon: int, *, coloured: bool = False
+) -> list[str]:
     """Return the NIS with its interval where outputs were measured.
 
-    It is a warning outside of that interval, since the band is then wrong.
+    It is a warning outside of that interval, since the band is then wrong. The NIS is that of one
+    step, the band that of the horizon.
     """
     from orthaug.models.response import BAND
 
@@ -438,21 +444,31 @@ def _of_band(found: Consistency, response: Response) -> list[str]:
     if not np.isfinite(found.nis) or not len(apart):
         return []
     held, (low, high) = float(np.mean(np.abs(apart) <= BAND)), found.expected
+    several = horizon > 1
     text = (
-        f"the squared innovations are {found.nis:.3g} times as large as the observer expects "
-        f"(NIS; {low:.3g} to {high:.3g} with the right noises). Its 95 % band contains "
-        f"{percent(held, 3)} of the measured values."
+        f"{'one step ahead, ' if several else ''}the squared innovations are {found.nis:.3g} times "
+        f"as large as the observer expects (NIS; {low:.3g} to {high:.3g} with the right noises). "
+        f"Its 95 % band{f' {horizon} steps ahead' if several else ''} contains {percent(held, 3)} "
+        "of the measured values."
     )
+    width = "too wide" if held > _WIDE else "too narrow" if held < _NARROW else ""
     if found.consistent:
-        return [f"note: {text}"]
+        ahead = f" For {horizon} steps, the band is {width}." if several and width else ""
+        return [f"note: {text}{ahead}"]
     why = (
         "its noises are too small, or the model is wrong here"
         if found.nis > high
         else "its noises are too large"
     )
+    remedy = "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
+    if coloured:
+        why = "the observer takes errors for white that the fitted noise model says are coloured"
+        remedy = "Predictions without --observer use the noise model."
+    if not several:
+        return [f"warning: {text} Do not use the band as one of 95 %: {why}. {remedy}"]
+    width = width or "about right"
     return [
-        f"warning: {text} Do not use the band as one of 95 %: {why}. "
-        "oa.Observer(oa.load(MODEL)).tuned(record) finds noises by the likelihood of a record."
+        f"warning: {text} For one step, {why}. For {horizon} steps, the band is {width}. {remedy}"
     ]
 
 

@@ -60,6 +60,10 @@ STD_KINDS = {
     "chosen": "none: the terms were chosen on the rows that were fitted",
 }
 """How standard errors were made, in words."""
+_COUNTED = (
+    "The intervals count noise only. `fit.diagnose()` tests whether something is missing from the "
+    "model."
+)
 WITHHELD = ("none", "chosen")
 """The kinds of fits that have none."""
 _FOR_THE_LIBRARY = {
@@ -473,7 +477,8 @@ class Estimate(FitView):
         warnings = (
             ["", *(f"warning: {warning}" for warning in self.warnings)] if self.warnings else []
         )
-        return "\n".join(fold([*self.lines(), *warnings]))
+        counted = ["", _COUNTED] if self.interval is not None else []
+        return "\n".join(fold([*self.lines(), *counted, *warnings]))
 
 
 def left_out(experiments: int) -> float:
