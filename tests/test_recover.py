@@ -328,3 +328,16 @@ def test_the_figure_is_there_for_a_draw_without_intervals(static):
         one |= {"ci95": None, "with_bias": None, "held": None, "held_with_bias": None}
     figure = recovery_figure(RecoverResult.model_validate(content))
     assert len(figure.axes) == 2
+
+
+@pytest.mark.parametrize(("shown", "said"), [(5, True), (6, False)])
+def test_estimates_without_an_interval_are_counted(shown, said):
+    from orthaug.reports.recovery import _sentences
+
+    row = {"name": "c", "draws": 3, "silent": 0, "more_rows_help": None}
+    rows = [
+        {**row, "held_with_bias": 3, "shown": 3},
+        {**row, "held_with_bias": 2, "shown": shown - 3},
+    ]
+    found = _sentences({"parameters": rows, "choices": [], "designs": [1]})
+    assert ("1 of 6 estimates have no interval." in found) == said

@@ -368,6 +368,8 @@ def _sentences(found: Mapping[str, Any]) -> list[str]:
         f"{held} of {shown} intervals hold the truth where the bias is counted; {silent} of {fits} "
         "miss it and nothing warns."
     ]
+    if shown < fits:
+        sentences.append(f"{fits - shown} of {fits} estimates have no interval.")
     stuck = [row["name"] for row in rows if row["more_rows_help"] is False]
     if stuck:
         bias = "its bias is" if len(stuck) == 1 else "their biases are"
