@@ -269,3 +269,12 @@ def test_where_a_row_came_from():
     assert Experiment(nothing, full, "run.csv", 10, 4, 2).where(3) == "run.csv: line 24 (row 22)"
     part = Experiment(nothing, full, "run.csv", 10, 4, 2).rows(2, None)
     assert (part.first_row, part.where(1)) == (18, "run.csv: line 24 (row 22)")
+
+
+def test_exchanged_axes_are_named():
+    u, y = np.arange(500.0), np.arange(500.0)
+    with pytest.raises(InputError, match=r"`u` has 1 row and 500 columns; rows are samples"):
+        Record.from_arrays(u[None], y[None])
+    with pytest.raises(InputError, match=r"`y` has 2 rows and 250 columns.*Give y\.T\."):
+        Record.from_arrays(None, y.reshape(2, 250))
+    assert len(Record.from_arrays(None, np.ones((25, 24)))) == 25

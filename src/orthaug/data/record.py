@@ -28,6 +28,7 @@ UNEVEN = (
     "needs even instants, and those of this record are uneven. Resample it: "
     '`[[data.prepare]] step = "resample"`, from Python `oa.prepare(record, oa.Resample())`.'
 )
+_FEW = 20  # rows: of fewer with as many channels or more, the axes are exchanged
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
 
 
@@ -331,6 +332,12 @@ class Record(NotebookView):
         check_choice(missing, ("error", "keep"), "`missing`")
         y_signal = None if y is None else as_signal(y, "y", gaps=missing == "keep")
         u_signal = None if u is None else as_signal(u, "u")
+        for name, signal in (("u", u_signal), ("y", y_signal)):
+            if signal is not None and len(signal) < _FEW <= signal.shape[1]:
+                raise InputError(
+                    f"`{name}` has {len(signal)} row{'s' * (len(signal) != 1)} and {signal.shape[1]} columns; rows "
+                    f"are samples, and columns are channels. Give {name}.T."
+                )
         rows = len(u_signal) if u_signal is not None else len(y_signal)  # type: ignore[arg-type]
         u_signal = np.empty((rows, 0)) if u_signal is None else u_signal
         y_signal = np.empty((rows, 0)) if y_signal is None else y_signal
