@@ -19,6 +19,7 @@ from orthaug._base.checks import (
     is_number,
 )
 from orthaug._base.errors import LONGEST, InputError, show, visible
+from orthaug._base.lines import plural
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import RESERVED, is_name
 from orthaug.data.prepared import Preparation, added_up
@@ -335,8 +336,8 @@ class Record(NotebookView):
         for name, signal in (("u", u_signal), ("y", y_signal)):
             if signal is not None and len(signal) < _FEW <= signal.shape[1]:
                 raise InputError(
-                    f"`{name}` has {len(signal)} row{'s' * (len(signal) != 1)} and {signal.shape[1]} columns; rows "
-                    f"are samples, and columns are channels. Give {name}.T."
+                    f"`{name}` has {plural(len(signal), 'row')} and {signal.shape[1]} columns; "
+                    f"rows are samples, and columns are channels. Give {name}.T."
                 )
         rows = len(u_signal) if u_signal is not None else len(y_signal)  # type: ignore[arg-type]
         u_signal = np.empty((rows, 0)) if u_signal is None else u_signal
@@ -432,10 +433,9 @@ class Record(NotebookView):
             f"{kind}: {', '.join(_counted(channel.name, lost) for channel in channels) or 'none'}"
             for kind, channels in (("inputs", self.inputs), ("outputs", self.outputs))
         )
-        plural = "s" if count != 1 else ""
         uneven = "" if self.even else " on average, uneven"
         return (
-            f"Record({count} experiment{plural}, {len(self)} samples, Ts = "
+            f"Record({plural(count, 'experiment')}, {len(self)} samples, Ts = "
             f"{self.sampling_time:g} s{uneven}, {names})"
         )
 
