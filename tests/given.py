@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -34,18 +35,10 @@ def file(name: str, seed: int) -> None:
 
 
 def friction(_: str) -> None:
-    """Two runs of a mass of 1 kg, a spring of 100 N/m, a damper of 2 N s/m and dry friction of 4 N."""
-    for name, rows, seed in (("run1.csv", 400, 1), ("run2.csv", 200, 2)):
-        rng = np.random.default_rng(seed)
-        force, position = np.repeat(rng.uniform(-20, 20, rows // 10), 10), np.zeros(rows)
-        x = v = 0.0
-        for i in range(rows):
-            position[i] = x
-            for _ in range(200):
-                v += 1e-4 * (force[i] - 2 * v - 100 * x - 4 * np.tanh(v / 0.05))
-                x += 1e-4 * v
-        table = np.column_stack([force, position + 1e-3 * rng.normal(size=rows)])
-        np.savetxt(name, table, delimiter=",", header="force,position", comments="", fmt="%.9g")
+    """The records of README, run1.csv and run2.csv, by the script that it names."""
+    runpy.run_path(
+        str(Path(__file__).resolve().parents[1] / "examples" / "readme.py"), run_name="__main__"
+    )
 
 
 def record() -> oa.Record:
