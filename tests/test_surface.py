@@ -262,8 +262,8 @@ def test_designs_are_refused_past_the_limits():
 
 
 def test_a_misspelt_name_is_answered_with_the_nearest():
-    with pytest.raises(AttributeError, match="orthaug has no 'estmate', did you mean 'estimate'"):
+    with pytest.raises(AttributeError, match="has no attribute 'estmate', did you mean 'estimate'"):
         oa.estmate  # noqa: B018
-    with pytest.raises(AttributeError, match="orthaug has no 'qqq'"):
+    with pytest.raises(AttributeError, match="has no attribute 'qqq'"):
         oa.qqq  # noqa: B018
     assert not hasattr(oa, "__wrapped__")

@@ -67,4 +67,6 @@ def __getattr__(name: str) -> Any:
         return _load(name)
     from orthaug._base.checks import nearest
 
-    raise AttributeError(f"orthaug has no '{name}'{nearest(name, __all__) or '.'}")
+    raise AttributeError(
+        f"module 'orthaug' has no attribute '{name}'{nearest(name, __all__) or '.'}"
+    )
