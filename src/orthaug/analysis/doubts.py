@@ -231,18 +231,9 @@ def with_found_change(
     Args:
         found: the change and its gain, as a sentence.
     """
-    if nearly_all:
-        done = f"{found} Make that change, and fit again."
-        others = [one for one in result.warnings if one.code != "hidden_state"]
-        return [
-            Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
-            if one.code == "unexplained"
-            else one
-            for one in others
-        ]
     left = _static_share(result)
     if left > _LEFT or result.unexplained is not None or not _is_disturbance(fit, result):
-        return list(result.warnings)
+        return _with_remedy(result, found) if nearly_all else list(result.warnings)
     only = _ONLY if _has_intervals(result) else ""
     text = (
         f"{_more_than_noise(result)}, and physics that is missing is its likely cause. {found} "
@@ -251,6 +242,18 @@ def with_found_change(
     return [
         Warning("unexplained", text) if warning.code == "unexplained" else warning
         for warning in result.warnings
+    ]
+
+
+def _with_remedy(result: Findings, found: str) -> list[Warning]:
+    """Return the warnings with a change as the remedy, and without a state that is missing."""
+    done = f"{found} Make that change, and fit again."
+    others = [one for one in result.warnings if one.code != "hidden_state"]
+    return [
+        Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
+        if one.code == "unexplained"
+        else one
+        for one in others
     ]
 
 
