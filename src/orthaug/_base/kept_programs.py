@@ -238,8 +238,13 @@ class KeptPrograms:
             (size,) = struct.unpack_from("<I", kept)
             result = json.loads(kept[4 : 4 + size])
             exported = export.deserialize(bytearray(kept[4 + size :]))
+
+        def run(*arrays: Any) -> Any:
+            return exported.call(*arrays)
+
+        run.__name__ = function.__name__  # of the compiled program on disk and in profiles
         # Its results are committed to their device, and `jit` would compile anew for these
-        lowered = jax.jit(exported.call).lower(*call.arrays)
+        lowered = jax.jit(run).lower(*call.arrays)
         return Program(lowered.compile(None if effort is None else dict(effort)), result)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -376,6 +376,7 @@ def _with_physics(run: Trajectory, physics: Matrix) -> Trajectory:
     return replace(run, baseline=physics, learner=learner, learner_before=learner, whole=run.model)
 
 
+@runtime_checkable
 class HoldsModel(Protocol):
     """An object with a fitted model, such as an estimate."""
 
