@@ -234,10 +234,10 @@ class KeptPrograms:
             text = json.dumps(result).encode()
             kept = struct.pack("<I", len(text)) + text + bytes(exported.serialize())
             self._cache.put(key, kept)
-        else:
-            (size,) = struct.unpack_from("<I", kept)
-            result = json.loads(kept[4 : 4 + size])
-            exported = export.deserialize(bytearray(kept[4 + size :]))
+        # Read back in the first process, too, or it would compile what the next one does not find
+        (size,) = struct.unpack_from("<I", kept)
+        result = json.loads(kept[4 : 4 + size])
+        exported = export.deserialize(bytearray(kept[4 + size :]))
 
         def run(*arrays: Any) -> Any:
             return exported.call(*arrays)
