@@ -128,64 +128,54 @@ def _code() -> bytes:
 
 
 def described(value: Any) -> Any:
-    """Return a result of a program as JSON, its arrays numbered in JAX's order.
+    """Return the containers of a program's result as JSON, 0 for each array.
 
     Raises:
         NotKept: a container that is not known.
     """
-    count = iter(range(10**9))
-
-    def of(part: Any) -> Any:
-        kind = type(part)
-        if part is None:
-            return None
-        if isinstance(part, tuple) and hasattr(part, "_fields"):
-            return {"named": _name_of(kind), "parts": [of(one) for one in part]}
-        if kind in (tuple, list):
-            return {kind.__name__: [of(one) for one in part]}
-        if hasattr(part, "dtype"):
-            return next(count)
-        raise NotKept(_name_of(kind))
-
-    return of(value)
+    kind = type(value)
+    if value is None:
+        return None
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return {"named": _name_of(kind), "parts": [described(one) for one in value]}
+    if kind in (tuple, list):
+        return {kind.__name__: [described(one) for one in value]}
+    if hasattr(value, "dtype"):
+        return 0
+    raise NotKept(_name_of(kind))
 
 
-def rebuilt(description: Any, arrays: Sequence[Any]) -> Any:
-    """Return the result that `described` describes, with its arrays.
+def rebuilt(description: Any) -> Any:
+    """Return the containers that `described` describes.
 
     Raises:
         NotKept: a name that is no named tuple of this package.
     """
-    if description is None:
-        return None
-    if isinstance(description, int):
-        return arrays[description]
+    if not isinstance(description, dict):
+        return description
     if "named" in description:
         module, _, name = description["named"].partition(":")
         kind: Any = sys.modules.get(module) if module.startswith("orthaug.") else None
-        if kind is None:
-            raise NotKept(module)
         for part in name.split("."):
-            kind = getattr(kind, part)
+            kind = getattr(kind, part, None)
         if not (isinstance(kind, type) and issubclass(kind, tuple)):
-            raise NotKept(name)
-        return kind(*(rebuilt(one, arrays) for one in description["parts"]))
+            raise NotKept(description["named"])
+        return kind(*map(rebuilt, description["parts"]))
     ((kind_name, parts),) = description.items()
-    made = (rebuilt(one, arrays) for one in parts)
-    return tuple(made) if kind_name == "tuple" else list(made)
+    return {"tuple": tuple, "list": list}[kind_name](map(rebuilt, parts))
 
 
 # ---------------------------------------------------------------- programs
 
 
 class Program(NamedTuple):
-    """A compiled function of the arrays of its arguments, and what its result is."""
+    """A compiled function of the arrays of its arguments, and the tree of its result."""
 
     run: Callable[..., Any]
-    result: Any
+    tree: Any
 
     def __call__(self, arrays: Sequence[Any]) -> Any:
-        return rebuilt(self.result, self.run(*arrays))
+        return self.tree.unflatten(self.run(*arrays))
 
 
 class KeptPrograms:
@@ -236,7 +226,7 @@ class KeptPrograms:
             self._cache.put(key, kept)
         # Read back in the first process, too, or it would compile what the next one does not find
         (size,) = struct.unpack_from("<I", kept)
-        result = json.loads(kept[4 : 4 + size])
+        tree = jax.tree.structure(rebuilt(json.loads(kept[4 : 4 + size])))
         exported = export.deserialize(bytearray(kept[4 + size :]))
 
         def run(*arrays: Any) -> Any:
@@ -245,7 +235,7 @@ class KeptPrograms:
         run.__name__ = function.__name__  # of the compiled program on disk and in profiles
         # Its results are committed to their device, and `jit` would compile anew for these
         lowered = jax.jit(run).lower(*call.arrays)
-        return Program(lowered.compile(None if effort is None else dict(effort)), result)
+        return Program(lowered.compile(None if effort is None else dict(effort)), tree)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

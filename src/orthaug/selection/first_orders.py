@@ -441,7 +441,7 @@ def _regression(record: Record, most: int) -> tuple[Matrix, Vector] | None:
     rows = OutputRows(record.experiments, 0, orders)
     phi, y = np.concatenate(rows.lags), rows.target
     phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-    if len(y) < 2 * orders.size or np.linalg.cond(phi) > 1 / RANK:
+    if len(y) < 2 * orders.size or np.linalg.cond(np.linalg.qr(phi, mode="r")) > 1 / RANK:
         return None
     return phi, y
 
