@@ -692,4 +692,4 @@ def test_inputs_of_a_motion_that_are_misread_are_named(read, code, said):
     assert code is None or texts[code].startswith(said)
     assert {"reversed_input", "exchanged_inputs"} & texts.keys() == ({code} if code else set())
     if code == "reversed_input":
-        assert "Most likely heat has the other sign" in found.residuals.text
+        assert "Most likely an input is misread: heat may have the other" in found.residuals.text

@@ -209,12 +209,8 @@ def _of_motion(
         late = () if misread else find_late_inputs(task, solver)
     explained = explained or bool(late or misread)
     verdict = "unmodelled" if explained else "white" if white else "equation_noise"
-    text = free_run_words(
-        verdict, fit, tests, shares, followed, curved, lacks or several, late, coarse, slight
-    )
-    if misread:
-        sure = misread[0].text.replace(" may have ", " has ").replace(" may be ", " are ")
-        text = f"{text.partition(' Most likely')[0]} Most likely {sure}"
+    lacking = (lacks or several, late, coarse, slight, misread)
+    text = free_run_words(verdict, fit, tests, shares, followed, curved, *lacking)
     warnings = [restarted[1]] if restarted else []
     warnings += [*misread, *(one.warning for one in late)]
     warnings += [coarse.warning] if coarse and coarse.warning else []

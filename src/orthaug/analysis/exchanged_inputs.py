@@ -27,6 +27,16 @@ _MOST_INPUTS = 5
 _MOST_ROWS = 20_000
 _FAR = 0.5  # of the outputs' deviation: physics alone that leaves less has its inputs right
 _NEAR = 0.3  # of it, which a correction must reach
+_MISTAKES = {
+    "reversed_input": (
+        "may have the other sign",
+        "Check its sign convention; `scale` of its channel takes the other sign.",
+    ),
+    "exchanged_inputs": (
+        "may be exchanged",
+        "Check the columns that these inputs are read from.",
+    ),
+}
 _ITERATIONS = 40  # from the initial values: where the wrong inputs led is no place to begin
 
 
@@ -96,23 +106,21 @@ def misread_inputs(task: MotionTask, solver: Any) -> tuple[Warning, ...]:
     names = [channel.name for channel in record.inputs]
     for i, name in enumerate(names):
         read = np.diag(np.where(np.arange(count) == i, -1.0, 1.0))
-        remedy = "Check its sign convention; `scale` of its channel takes the other sign."
-        found.append((_run_with(task, read, solver), f"{name} may have the other sign", remedy))
+        found.append((_run_with(task, read, solver), "reversed_input", name))
     for a, b in itertools.combinations(range(count), 2):
         read = np.eye(count)
         read[[a, b]] = read[[b, a]]
-        remedy = "Check the columns that these inputs are read from."
-        text = f"{names[a]} and {names[b]} may be exchanged"
-        found.append((_run_with(task, read, solver), text, remedy))
-    after, text, remedy = min(found)
+        both = f"{names[a]} and {names[b]}"
+        found.append((_run_with(task, read, solver), "exchanged_inputs", both))
+    after, code, which = min(found)
     if not after < min(_NEAR, _CLEARLY * before):
         return ()
-    code = "reversed_input" if "sign" in text else "exchanged_inputs"
-    said = (
-        f"{text}: so read, physics alone has a free-run error of {after:.3g} instead of "
+    mistake, remedy = _MISTAKES[code]
+    text = (
+        f"{which} {mistake}: so read, physics alone has a free-run error of {after:.3g} instead of "
         f"{before:.3g} standard deviations of the output. {remedy}"
     )
-    return (Warning(code, said),)
+    return (Warning(code, text),)
 
 
 def _run_with(task: MotionTask, read: Matrix, solver: Any) -> float:

@@ -1,10 +1,20 @@
-"""A term that a motion's equation may lack: its shape, as an expression and in words."""
+"""Terms that a motion's equation may lack: which are tried, their values, what they are called."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias import place_of
+from orthaug.analysis.suspects import changes_sign
+from orthaug.physics.motion import Motion
+
+_EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
+_MOST_FACTORS = 5  # states and inputs, of which products are tried
 
 SHAPES = ("linear", "jump", "absolute", "square", "cube", "drag")
 POWERS = (1, 0, 1, 2, 3, 2)
@@ -124,3 +134,119 @@ class MissingTerm:
         meaning = self.meaning  # a sensor has no springs and no friction
         meaning = meaning if self.equation is not None else meaning.partition(", as")[0]
         return f"{self.place} lacks something {meaning}: {self.expression}"
+
+
+Product = tuple[int, int, int, int]
+"""Two variables and their powers."""
+
+
+class Tried(NamedTuple):
+    """The terms that are tried in each equation, and what makes them of the points.
+
+    A constant and the shapes of each variable are the simple ones; products and terms that begin
+    beyond a size of a variable follow.
+    """
+
+    names: tuple[str, ...]
+    choice: Matrix
+    """Rows (n, nx + nu) of the variables by states and inputs."""
+    products: list[Product]
+    beyond: tuple[float, ...]
+    """Shares of a variable's size that are the widths."""
+
+    @property
+    def simple(self) -> int:
+        """Number of simple terms."""
+        return 1 + len(SHAPES) * len(self.names)
+
+    @property
+    def count(self) -> int:
+        """Number of all terms."""
+        return self.simple + len(self.products) + len(self.beyond) * len(self.names)
+
+
+class Sizes(NamedTuple):
+    """What is known of the variables along the runs."""
+
+    largest: Vector
+    one_sided: list[bool]
+    """True for those that keep their sign."""
+    widths: Matrix
+    """Widths (w, n) in units of the largest size."""
+
+    @classmethod
+    def of(cls, values: Matrix, shares: tuple[float, ...]) -> Sizes:
+        """Return the sizes of variables (n, M)."""
+        size = np.abs(values)
+        largest = size.max(axis=1, initial=0.0)
+        largest = np.where(largest > 0, largest, 1.0)
+        widths = np.quantile(size / largest[:, None], shares, axis=1)
+        return cls(largest, [not changes_sign(one) for one in values], widths)
+
+
+def variables_of(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
+    """Return the names of the variables of terms, and their rows (n, nx + nu) by states and inputs.
+
+    They are the states and inputs that a learner may see, and differences of two of them that
+    stand in the equations.
+    """
+    every, names = (*motion.names_of_states, *motion.inputs), motion.visible
+    unit = np.eye(len(every))
+    pairs = [pair for pair in motion.differences if set(pair) <= set(names)]
+    rows = [unit[every.index(name)] for name in names]
+    rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
+    return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
+
+
+def products_of(names: tuple[str, ...]) -> list[Product]:
+    """Return the products of two variables, each linear or one squared; none of many variables."""
+    if len(names) > _MOST_FACTORS:
+        return []
+    pairs = itertools.combinations(range(len(names)), 2)
+    return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
+
+
+def values_of(tried: Tried, sizes: Sizes, rows: Matrix) -> Any:
+    """Return the terms (count, r) of states and inputs (nx + nu, r).
+
+    Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
+    their places.
+    """
+    z = tried.choice @ rows / sizes.largest[:, None]
+    size, turns = np.abs(z), np.logical_not(sizes.one_sided)[:, None]
+    jump, kink, drag = (one * turns for one in (np.tanh(z / _EDGE), size, z * size))
+    shaped = np.stack([z, jump, kink, z**2, z**3, drag], axis=1)
+    multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in tried.products]
+    beyond = [z - np.clip(z, -w[:, None], w[:, None]) for w in sizes.widths]
+    each = (values for own in (*shaped, *beyond) for values in own)
+    simple = list(itertools.islice(each, tried.simple - 1))
+    return np.stack([np.ones(z.shape[1]), *simple, *multiplied, *each])
+
+
+def term_of(
+    tried: Tried, sizes: Sizes, equation: str, number: int, coefficient: float, share: float
+) -> MissingTerm:
+    """Return the term of a number among those that are tried."""
+    names, largest = tried.names, sizes.largest
+    if number == 0:
+        return MissingTerm(equation, None, "constant", coefficient, share)
+    if number < tried.simple:
+        variable, shape = divmod(number - 1, len(SHAPES))
+        coefficient /= float(largest[variable]) ** POWERS[shape]
+        one_sided = sizes.one_sided[variable]
+        return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided)
+    number -= tried.simple
+    if number < len(tried.products):
+        first, second, a, b = tried.products[number]
+        coefficient /= float(largest[first] ** a * largest[second] ** b)
+        factors = (names[first], names[second])
+        product = "*".join(
+            name if power == 1 else f"{name}**{power}"
+            for name, power in zip(factors, (a, b), strict=True)
+        )
+        return MissingTerm(equation, product, "linear", coefficient, share, factors=factors)
+    level, variable = divmod(number - len(tried.products), len(names))
+    size = float(largest[variable])
+    width = size * float(sizes.widths[level, variable])
+    made = (equation, names[variable], BEYOND, coefficient / size, share)
+    return MissingTerm(*made, sizes.one_sided[variable], width=width)

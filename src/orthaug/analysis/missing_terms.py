@@ -13,10 +13,9 @@ does not pass for colour.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.special
@@ -24,8 +23,17 @@ from jaxtyping import Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
-from orthaug.analysis.missing_term import BEYOND, POWERS, SHAPES, MissingTerm
-from orthaug.analysis.suspects import changes_sign
+from orthaug.analysis.missing_term import (
+    BEYOND,
+    SHAPES,
+    MissingTerm,
+    Sizes,
+    Tried,
+    products_of,
+    term_of,
+    values_of,
+    variables_of,
+)
 from orthaug.analysis.term_sensitivities import (
     Sensitivities,
     Terms,
@@ -36,7 +44,6 @@ from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.whiteness import whitening_filter
 from orthaug.physics.motion import Motion
 
-_EDGE = 0.05  # of the largest value: over which a jump at zero is smoothed
 # Shares of a variable's size, by quantiles: the widths that are tried, and those for the best one
 _WIDTHS, _FINER = (0.5, 0.8), tuple(np.linspace(0.1, 0.95, 18).tolist())
 # Of a column's size: what remains of it beside all that was estimated, so that it is one of its own
@@ -47,7 +54,6 @@ _PROBED = 20  # points at which an equation is looked at
 _MOVED = 1e-3  # of a parameter, to see whether an equation has it
 _ALONE = 0.05  # of the errors' variance: what a single term explains below it is small
 _TOGETHER_LEVEL, _TOGETHER = 1e-6, 0.2  # of the joint test, and of the errors' variance
-_MOST_FACTORS = 5  # states and inputs, of which products are tried
 _ROWS_PER_PRODUCT = 10
 _CURVED = 0.95  # of its gain: a curved term that counts from a level is named before a straight one
 _RIVAL = 0.9  # of the best term's share, with which another one is named beside it
@@ -101,54 +107,6 @@ class _Regression(NamedTuple):
     left: int
 
 
-Product = tuple[int, int, int, int]
-"""Two variables and their powers."""
-
-
-class _Tried(NamedTuple):
-    """The terms that are tried in each equation, and what makes them of the points.
-
-    A constant and the shapes of each variable are the simple ones; products and terms that begin
-    beyond a size of a variable follow.
-    """
-
-    names: tuple[str, ...]
-    choice: Matrix
-    """Rows (n, nx + nu) of the variables by states and inputs."""
-    products: list[Product]
-    beyond: tuple[float, ...]
-    """Shares of a variable's size that are the widths."""
-
-    @property
-    def simple(self) -> int:
-        """Number of simple terms."""
-        return 1 + len(SHAPES) * len(self.names)
-
-    @property
-    def count(self) -> int:
-        """Number of all terms."""
-        return self.simple + len(self.products) + len(self.beyond) * len(self.names)
-
-
-class _Sizes(NamedTuple):
-    """What is known of the variables along the runs."""
-
-    largest: Vector
-    one_sided: list[bool]
-    """True for those that keep their sign."""
-    widths: Matrix
-    """Widths (w, n) in units of the largest size."""
-
-    @classmethod
-    def of(cls, values: Matrix, shares: tuple[float, ...]) -> _Sizes:
-        """Return the sizes of variables (n, M)."""
-        size = np.abs(values)
-        largest = size.max(axis=1, initial=0.0)
-        largest = np.where(largest > 0, largest, 1.0)
-        widths = np.quantile(size / largest[:, None], shares, axis=1)
-        return cls(largest, [not changes_sign(one) for one in values], widths)
-
-
 def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
@@ -199,13 +157,18 @@ def _shared_inputs(fit: MotionEstimate) -> tuple[int, ...]:
 
 def _acting(fit: MotionEstimate, number: int) -> Matrix:
     """Return ∂f/∂u (m, nx) of an input, counted behind states and outputs, at some points."""
-    motion, segmented = fit.problem.motion, fit.segmented
-    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
-    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
-    every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
-    rows = np.concatenate([x[every], u[every]], axis=1)
+    motion, (x, u, p) = fit.problem.motion, _along(fit)
+    rows = np.concatenate([x, u], axis=1)
     with np.errstate(all="ignore"):
-        return np.nan_to_num(input_slopes(motion, rows, motion.coordinates.physical(c), number))
+        return np.nan_to_num(input_slopes(motion, rows, p, number))
+
+
+def _along(fit: MotionEstimate) -> tuple[Matrix, Matrix, Vector]:
+    """Return states and inputs at some points of the runs, and the physical parameters."""
+    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
+    x, u = fit.segmented.trajectory(c, fit.model.numbers.weights, fit.states)
+    every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
+    return x[every], u[every], fit.problem.motion.coordinates.physical(c)
 
 
 def _is_a_shift(term: MissingTerm, motion: Motion) -> bool:
@@ -226,15 +189,15 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     nx, ny = len(motion.states), len(motion.outputs)
     names = (*motion.names_of_states, *(output.name for output in motion.outputs), *motion.inputs)
     rows = int(fit.segmented.observations.sum())
-    tried = _Tried(*_variables(motion), _products(motion.visible), _WIDTHS)
+    tried = Tried(*variables_of(motion), products_of(motion.visible), _WIDTHS)
     for fewer in ({"products": []}, {"beyond": ()}):
         if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
             tried = tried._replace(**fewer)
-    sizes: list[_Sizes] = []
+    sizes: list[Sizes] = []
 
     def terms(points: Matrix) -> Terms:
-        sizes.append(_Sizes.of(tried.choice @ points, tried.beyond))
-        return lambda rows: _values(tried, sizes[0], rows)
+        sizes.append(Sizes.of(tried.choice @ points, tried.beyond))
+        return lambda rows: values_of(tried, sizes[0], rows)
 
     found = sensitivities(fit, equations, terms, tried.count)
     if found is None:
@@ -275,7 +238,7 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
             continue
         at, number = divmod(int(j), tried.count)
         made = (names[equations[at]], number, float(coefficients[j]), float(shares[j]))
-        term = _term(tried, sizes[0], *made)
+        term = term_of(tried, sizes[0], *made)
         if np.isfinite(references[j]):
             unit = float(coefficients[j]) / term.coefficient
             term = replace(term, reference=float(references[j]) * unit)
@@ -308,7 +271,7 @@ def _moved_by(fit: MotionEstimate, equation: int) -> Vector:
     return (np.arange(nx) == equation).astype(float)
 
 
-def _own(tried: _Tried, moved: Vector) -> Vector:
+def _own(tried: Tried, moved: Vector) -> Vector:
     """Return how the variable of each term follows the states that it moves; 0 where not."""
     found = np.zeros(tried.count)
     found[1 : tried.simple] = np.repeat(tried.choice[:, : len(moved)] @ moved, len(SHAPES))
@@ -324,8 +287,7 @@ def _acts_against(
         moved: directions (nx,) in which the term moves the states.
         row: of the variable (nx + nu,) by states and inputs.
     """
-    motion, segmented = fit.problem.motion, fit.segmented
-    nx = len(motion.states)
+    motion, nx = fit.problem.motion, len(fit.problem.motion.states)
     if row[nx:].any():
         return None
     if (along := float(row[:nx] @ moved)) != 0:
@@ -333,9 +295,8 @@ def _acts_against(
     if moved.astype(bool).sum() != 1:
         return None
     equation = int(np.argmax(np.abs(moved)))
-    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
-    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
-    point, inputs, p = x[len(x) // 2], u[len(x) // 2], motion.coordinates.physical(c)
+    x, u, p = _along(fit)
+    point, inputs = x[len(x) // 2], u[len(x) // 2]
     step = _MOVED * max(float(np.abs(x[:, equation]).max()), _MOVED) * (np.arange(nx) == equation)
     with np.errstate(all="ignore"):
         before, after = (
@@ -357,19 +318,19 @@ def _with_finer(listed: list[MissingTerm], best: MissingTerm) -> list[MissingTer
 
 
 def _finer(
-    fit: MotionEstimate, tried: _Tried, equation: int, term: MissingTerm
+    fit: MotionEstimate, tried: Tried, equation: int, term: MissingTerm
 ) -> MissingTerm | None:
     """Return a term of the same variable that begins beyond a size, the best of many sizes.
 
     None where it explains no more than the given one.
     """
     i = tried.names.index(str(term.variable))
-    one = _Tried((tried.names[i],), tried.choice[i : i + 1], [], _FINER)
-    sizes: list[_Sizes] = []
+    one = Tried((tried.names[i],), tried.choice[i : i + 1], [], _FINER)
+    sizes: list[Sizes] = []
 
     def terms(points: Matrix) -> Terms:
-        sizes.append(_Sizes.of(one.choice @ points, _FINER))
-        return lambda rows: _values(one, sizes[0], rows)[one.simple :]
+        sizes.append(Sizes.of(one.choice @ points, _FINER))
+        return lambda rows: values_of(one, sizes[0], rows)[one.simple :]
 
     found = sensitivities(fit, [equation], terms, len(_FINER))
     tested = None if found is None else _joint_test(found)
@@ -379,34 +340,12 @@ def _finer(
     j = int(np.argmax(gains))
     made = ("", one.simple + j, float(coefficients[j]), float(shares[j]))
     best = replace(
-        _term(one, sizes[0], *made),
+        term_of(one, sizes[0], *made),
         equation=term.equation,
         output=term.output,
         beside=term.beside,
     )
     return best if best.share > term.share else None
-
-
-def _variables(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
-    """Return the names of the variables of terms, and their rows (n, nx + nu) by states and inputs.
-
-    They are the states and inputs that a learner may see, and differences of two of them that
-    stand in the equations.
-    """
-    every, names = (*motion.names_of_states, *motion.inputs), motion.visible
-    unit = np.eye(len(every))
-    pairs = [pair for pair in motion.differences if set(pair) <= set(names)]
-    rows = [unit[every.index(name)] for name in names]
-    rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
-    return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
-
-
-def _products(names: tuple[str, ...]) -> list[Product]:
-    """Return the products of two variables, each linear or one squared; none of many variables."""
-    if len(names) > _MOST_FACTORS:
-        return []
-    pairs = itertools.combinations(range(len(names)), 2)
-    return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
 
 
 def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -415,11 +354,7 @@ def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, 
     Equations of outputs are counted behind those of states. Others of states, such as ẋ = v, define
     a state. All states, if there is none with a parameter.
     """
-    motion, segmented = fit.problem.motion, fit.segmented
-    c = np.asarray(fit.model.numbers.theta - fit.model.numbers.theta_aux)
-    p = motion.coordinates.physical(c)
-    x, u = segmented.trajectory(c, fit.model.numbers.weights, fit.states)
-    every = np.unique(np.linspace(0, len(x) - 1, _PROBED).astype(int))
+    motion, (x, u, p) = fit.problem.motion, _along(fit)
     nx, ny = len(motion.states), len(motion.outputs)
     moved = {*motion.learned[0], *(nx + j for j in motion.learned[1])}
 
@@ -428,7 +363,7 @@ def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, 
         return np.concatenate([rates, np.asarray(motion.observed(point, row, p, np))])
 
     with np.errstate(all="ignore"):
-        for point, row in zip(x[every], u[every], strict=True):
+        for point, row in zip(x, u, strict=True):
             here = values(point, row, p)
             for i in range(len(p)):
                 there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
@@ -438,53 +373,7 @@ def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, 
     return tuple(sorted(moved)), tuple(i for i in range(nx, nx + ny) if i not in moved)
 
 
-def _values(tried: _Tried, sizes: _Sizes, rows: Matrix) -> Any:
-    """Return the terms (count, r) of states and inputs (nx + nu, r).
-
-    Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take
-    their places.
-    """
-    z = tried.choice @ rows / sizes.largest[:, None]
-    size, turns = np.abs(z), np.logical_not(sizes.one_sided)[:, None]
-    jump, kink, drag = (one * turns for one in (np.tanh(z / _EDGE), size, z * size))
-    shaped = np.stack([z, jump, kink, z**2, z**3, drag], axis=1)
-    multiplied = [z[i] ** a * z[j] ** b for i, j, a, b in tried.products]
-    beyond = [z - np.clip(z, -w[:, None], w[:, None]) for w in sizes.widths]
-    each = (values for own in (*shaped, *beyond) for values in own)
-    simple = list(itertools.islice(each, tried.simple - 1))
-    return np.stack([np.ones(z.shape[1]), *simple, *multiplied, *each])
-
-
-def _term(
-    tried: _Tried, sizes: _Sizes, equation: str, number: int, coefficient: float, share: float
-) -> MissingTerm:
-    """Return the term of a number among those that are tried."""
-    names, largest = tried.names, sizes.largest
-    if number == 0:
-        return MissingTerm(equation, None, "constant", coefficient, share)
-    if number < tried.simple:
-        variable, shape = divmod(number - 1, len(SHAPES))
-        coefficient /= float(largest[variable]) ** POWERS[shape]
-        one_sided = sizes.one_sided[variable]
-        return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided)
-    number -= tried.simple
-    if number < len(tried.products):
-        first, second, a, b = tried.products[number]
-        coefficient /= float(largest[first] ** a * largest[second] ** b)
-        factors = (names[first], names[second])
-        product = "*".join(
-            name if power == 1 else f"{name}**{power}"
-            for name, power in zip(factors, (a, b), strict=True)
-        )
-        return MissingTerm(equation, product, "linear", coefficient, share, factors=factors)
-    level, variable = divmod(number - len(tried.products), len(names))
-    size = float(largest[variable])
-    width = size * float(sizes.widths[level, variable])
-    made = (equation, names[variable], BEYOND, coefficient / size, share)
-    return MissingTerm(*made, sizes.one_sided[variable], width=width)
-
-
-def _constants(tried: _Tried, sizes: _Sizes, equations: int) -> Int[np.ndarray, "q"]:
+def _constants(tried: Tried, sizes: Sizes, equations: int) -> Int[np.ndarray, "q"]:
     """Return for each term the number of the constant beside which it is tried, -1 for none.
 
     A linear term of an absolute temperature is mostly its mean: with a constant it counts from a

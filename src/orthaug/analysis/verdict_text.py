@@ -405,11 +405,13 @@ def free_run_words(
     late: tuple[LateInput, ...],
     coarse: QuantisedOutput | None = None,
     slight: MissingTest | None = None,
+    misread: tuple[Warning, ...] = (),
 ) -> str:
     """Return the verdict on a motion's free run in words, with its reason.
 
     Args:
         slight: terms that surely explain a little of it.
+        misread: what the record shows of inputs that are read wrongly.
         coarse: the steps of the outputs, where these are most of the error.
     """
     units = {c.name: c.unit for c in fit.problem.record.outputs}
@@ -452,6 +454,11 @@ def free_run_words(
             f"{subject} ({sizes}) is coloured ({colour}). The tests of the residual find "
             f"{no_term}{cause} {fed}disturbances, or physics missing in an equation "
             f"{learner}.{remedy}"
+        )
+    if misread:
+        return (
+            f"{subject} ({sizes}) contains more than noise. Most likely an input is misread: "
+            f"{misread[0].text}"
         )
     if late:
         return (
