@@ -8,8 +8,10 @@ A package declares them in its `pyproject.toml`, for example
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Container
-from importlib.metadata import entry_points
+from functools import cache
+from importlib import metadata
 from typing import Any
 
 from orthaug._base.errors import InputError
@@ -26,6 +28,17 @@ EXPORTERS = "orthaug.exporters"
 """Group of targets of `orthaug export`: frozen dataclasses with `summary`, `files`, `usage`."""
 READERS = "orthaug.readers"
 """Group of readers: functions of a path that return columns by name, called as the ending."""
+
+
+def entry_points(group: str) -> metadata.EntryPoints:
+    """Return what installed packages declare in a group."""
+    return _declared(group, tuple(map(str, sys.path)))
+
+
+@cache
+def _declared(group: str, path: tuple[str, ...]) -> metadata.EntryPoints:
+    """Read a group from the metadata of all packages on a search path, once in a process."""
+    return metadata.entry_points(group=group)
 
 
 def discover(group: str, axis: str, known: Container[str], add: Callable[[str, Any], None]) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import jnp
@@ -142,6 +141,8 @@ class Smoother:
         known = self._basis @ (self._basis.T @ values)
         if x is self.problem.rows.x and len(known) == len(x):
             return known
+        from scipy.spatial import KDTree  # slow to import, and few fits need it
+
         return known[KDTree(self.inputs).query(self._z(x))[1]]
 
 

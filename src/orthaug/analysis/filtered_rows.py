@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
+from orthaug._base.filters import autoregression, moving_sum
 from orthaug.analysis.output_response import LinearRun
 from orthaug.fitting.whiteness import whitening_filter
 
@@ -51,7 +51,7 @@ def error_colours(
     drawn = np.random.default_rng(_SEED).standard_normal((n, ny))
     for _ in range(_FILLINGS):
         sizes = rest.reshape(n, ny).std(axis=0) / shown
-        noise = np.stack([lfilter([1.0], a, drawn[:, o]) for o, a in enumerate(colours)], axis=1)
+        noise = np.stack([autoregression(a, drawn[:, o]) for o, a in enumerate(colours)], axis=1)
         noise = (noise / noise.std(axis=0) * sizes).reshape(-1)
         whole = np.split((rest + q @ (q.T @ noise)).reshape(n, ny), lengths)
         found = [whitening_filter([piece[:, o] for piece in whole]) for o in range(ny)]
@@ -62,7 +62,5 @@ def error_colours(
 def filter_rows(piece: np.ndarray, colours: list[Vector]) -> Matrix:
     """Return columns and errors (T, ny, k), filtered by the autoregression of each output."""
     memory = max(map(len, colours)) - 1
-    rows = np.stack(
-        [lfilter(a, [1.0], piece[:, o], axis=0)[memory:] for o, a in enumerate(colours)], axis=1
-    )
+    rows = np.stack([moving_sum(a, piece[:, o])[memory:] for o, a in enumerate(colours)], axis=1)
     return rows.reshape(-1, piece.shape[2])

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.filters import autoregression
 from orthaug._base.lines import join_words
 from orthaug.analysis.mapped_bias import physical_slopes
 from orthaug.data.expressions import parse, parse_named
@@ -334,8 +335,6 @@ def _followed_by_memory(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -
     tried from a few samples to an integral; as many are taken as the learner has states, those that
     explain most.
     """
-    from scipy.signal import lfilter  # slow to import, and few fits need it
-
     motion, nx = form.motion, x.shape[1]
     places = [i for i in learned_places(motion) if i >= nx or not motion.states[i].memory]
     slopes = np.asarray(slopes_at(form, q, x, u))[:, places]
@@ -347,7 +346,7 @@ def _followed_by_memory(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -
     slopes, z = slopes[kept], z[kept][:, own]
     z = z / np.where(z.std(axis=0) > 0, z.std(axis=0), 1.0)
     kept_per_sample = 1 - np.append(np.geomspace(1 / len(z), 0.2, _LAGS), 0.0)
-    bank = np.concatenate([lfilter([1.0], [1.0, -a], z, axis=0) for a in kept_per_sample], axis=1)
+    bank = np.concatenate([autoregression(np.array([1.0, -a]), z) for a in kept_per_sample], axis=1)
     static = np.concatenate([np.ones((len(z), 1)), z], axis=1)
     followed = set()
     for j, name in enumerate(motion.names):

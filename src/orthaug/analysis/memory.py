@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthaug._base.checks import Vector
+from orthaug._base.filters import autoregression
 
 KINDS = ("lag", "backlash", "lugre", "bouc_wen")
 WORDS = {
@@ -49,10 +50,9 @@ class MemoryTerm:
         `z⁺ = z + d − (|d| |z| z + d z²)/(2w²)`.
         """
         if self.kind == "lag":
-            from scipy.signal import lfilter  # slow to import, and few fits need it
-
             pole = float(np.exp(-sampling_time / self.scale))
-            return lfilter([0.0, 1 - pole], [1.0, -pole], values, zi=[values[0]])[0]
+            driven = np.append(values[0], (1 - pole) * values[:-1])
+            return autoregression(np.array([1.0, -pole]), driven)
         width, state = self.scale, 0.0
         if self.kind == "backlash":
             state, found = float(values[0]), []

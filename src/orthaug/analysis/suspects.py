@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +25,7 @@ from orthaug._base.checks import (
     nearest,
 )
 from orthaug._base.errors import InputError
+from orthaug.analysis.memory import MemoryTerm
 from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, is_name, parse, parse_named
 from orthaug.data.regressors import Layout
 from orthaug.physics.motion import Motion
@@ -35,9 +36,6 @@ from orthaug.physics.suspected_motion import (
     equations_of,
     usual_places,
 )
-
-if TYPE_CHECKING:
-    from orthaug.analysis.memory import MemoryTerm
 
 
 class _Kind(NamedTuple):
@@ -414,8 +412,6 @@ def memory_of(
     """
     if kind not in WITH_MEMORY:
         return None
-    from orthaug.analysis.memory import MemoryTerm  # it imports scipy.signal
-
     scale = time_constant if kind == "lag" else width
     assert on is not None and scale is not None, "`suspect_text` has checked them"
     return MemoryTerm(kind, on, float(scale))

@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.parallel import one_blas_thread
@@ -264,6 +263,8 @@ class _Smoother:
 
         The error of that mean itself is taken out.
         """
+        from scipy.spatial import KDTree  # slow to import, and few fits need it
+
         found = np.empty_like(rest)
         for fold in range(_FOLDS):
             here = self.fold == fold
