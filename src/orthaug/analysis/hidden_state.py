@@ -275,9 +275,7 @@ class _OfOutputs:
         """Places of the equations to which a function of the learner's inputs may be added."""
         return [place for place, _ in self.doubted]
 
-    def enter(
-        self, run: LinearRun, place: int, columns: Matrix, step: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def enter(self, run: LinearRun, place: int, columns: Matrix) -> tuple[np.ndarray, np.ndarray]:
         """Return by what signals (T, k) that are added to an equation move state and outputs."""
         (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
         into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
@@ -321,16 +319,14 @@ class _OfStates:
     def learned(self) -> list[int]:
         return list(self.form.motion.learned[0])
 
-    def enter(
-        self, run: LinearRun, place: int, columns: Matrix, step: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def enter(self, run: LinearRun, place: int, columns: Matrix) -> tuple[np.ndarray, np.ndarray]:
         (t, k), n0, ny = columns.shape, run.states.shape[1], run.error.shape[1]
         into_state, into_output = np.zeros((t, n0, k)), np.zeros((t, ny, k))
         if self.form.motion.scheme.discrete:
             into_state[:, place] = columns
         else:
-            half = step / 2
-            into_state += half * run.to_state[:, :, place, None] * columns[:, None]
+            half = run.steps[:, None] / 2
+            into_state += half[..., None] * run.to_state[:, :, place, None] * columns[:, None]
             into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
         return into_state, into_output
 
@@ -348,7 +344,7 @@ def _equations(model: Model) -> _OfOutputs | _OfStates:
 
 def _respond(model: Model, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:
     """Compute how the outputs follow signals (T, k) that are added to an equation, (T, ny, k)."""
-    entering = _equations(model).enter(run, place, columns, model.sampling_time)
+    entering = _equations(model).enter(run, place, columns)
     return run.respond(*entering, np.zeros((run.states.shape[1], columns.shape[1])))
 
 

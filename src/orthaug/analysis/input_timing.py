@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.filtered_rows import filter_rows
 from orthaug.analysis.memory import MemoryTerm
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
@@ -17,16 +19,20 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.structures import Structure
+from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.learners import Learner, nothing_learned
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.problem import MotionProblem
 
+Measure = Callable[[SegmentedMotion, FreeRunFit | None], float]
+"""Size of the errors of a fit; inf without one."""
 ROWS = 4000  # at most
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
 _EXPLAINED = 0.7  # of the output's deviation: what is left above it is not explained by a delay
 _ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
+_ALIKE_AHEAD = 0.05  # of errors ahead, which are those of all rows alike
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -196,6 +202,8 @@ class LateInput:
     lag: int
     lagged: float
     declared: float
+    ahead: bool = False
+    """True if the errors are those that the errors' own past does not predict."""
 
     @property
     def by_lag(self) -> bool:
@@ -209,9 +217,12 @@ class LateInput:
         slow = f"a first-order lag of {self.time_constant:.3g} s"
         pairs = [(slow, self.lagged), (late, self.delayed)]
         (better, least), (other, more) = pairs if self.by_lag else pairs[::-1]
+        error = "the error of physics alone"
+        if self.ahead:
+            error = "what the past does not predict of the error of physics alone"
         return (
-            f"with {better} the error of physics alone is {least:.3g} standard deviations of the "
-            f"output instead of {self.declared:.3g} ({more:.3g} with {other})"
+            f"with {better} {error} is {least:.3g} standard deviations of the output instead of "
+            f"{self.declared:.3g} ({more:.3g} with {other})"
         )
 
     @property
@@ -222,7 +233,8 @@ class LateInput:
     @property
     def alike(self) -> bool:
         """True if the data hardly distinguish a lag from a delay."""
-        return abs(self.lagged - self.delayed) < _ALIKE * min(self.lagged, self.delayed)
+        alike = _ALIKE_AHEAD if self.ahead else _ALIKE
+        return abs(self.lagged - self.delayed) < alike * min(self.lagged, self.delayed)
 
     @property
     def manner(self) -> str:
@@ -271,29 +283,61 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
     """
     if task.physics is None:
         return ()
-    found, most = [], len(task.problem.record) // _LONGEST
-    sampling_time = task.problem.record.sampling_time
-    declared = residual_of(task.plan, task.physics)
-    for number, name in enumerate(task.problem.motion.external):
-        delays, lags = (
-            _LateFits(task, solver, number, change, {0: (declared, task.physics)})
-            for change in (_delay, _lag)
-        )
-        best = _lowest_argument(delays.leaves, most)
-        if delays.leaves(best) < min((1 - _LATE) * declared, _EXPLAINED):
-            slow = _lowest_argument(lags.leaves, most)
-            found.append(
-                LateInput(
-                    name,
-                    sampling_time,
-                    best,
-                    delays.leaves(best),
-                    slow,
-                    lags.leaves(slow),
-                    declared,
-                )
+    names, sampling_time = task.problem.motion.external, task.problem.record.sampling_time
+    most = len(task.problem.record) // _LONGEST
+    declared = (task.plan, task.physics)
+    found: dict[str, LateInput] = {}
+    fits = {
+        (number, change): _LateFits(task, solver, number, change, {0: declared})
+        for number in range(len(names))
+        for change in (_delay, _lag)
+    }
+    for measure in (residual_of, _unpredicted_beside(*declared)):
+        for number, name in enumerate(names):
+            if name in found or measure is None:
+                continue
+            delayed, lagged = (
+                partial(fits[number, change].leaves, measure) for change in (_delay, _lag)
             )
-    return tuple(found)
+            best, before = _lowest_argument(delayed, most), measure(*declared)
+            if delayed(best) < min((1 - _LATE) * before, _EXPLAINED):
+                slow = _lowest_argument(lagged, most)
+                late = LateInput(
+                    name, sampling_time, best, delayed(best), slow, lagged(slow), before
+                )
+                found[name] = replace(late, ahead=measure is not residual_of)
+    return tuple(found[name] for name in names if name in found)
+
+
+def _unpredicted_beside(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> Measure | None:
+    """Return what measures the part of errors that the past of a fit's errors does not predict.
+
+    Slow disturbances leave errors beside which an input's delay is small, but sudden. Those are
+    filtered by the autoregression of the errors as they were.
+    """
+    if free_fit is None or not segmented.record.complete:
+        return None
+    pieces = _errors(segmented, free_fit)
+    outputs = range(pieces[0].shape[1])
+    colours = [whitening_filter([piece[:, o] for piece in pieces]) for o in outputs]
+    known = [np.ones(1) if colour is None else colour for colour in colours]
+
+    def unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
+        if free_fit is None:
+            return float("inf")
+        rows = [filter_rows(piece[..., None], known) for piece in _errors(segmented, free_fit)]
+        value = float(np.sqrt(np.mean(np.concatenate(rows) ** 2)))
+        return value if np.isfinite(value) else float("inf")
+
+    return unpredicted
+
+
+def _errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> list[Matrix]:
+    """Return a free run's errors (T, ny) in every segment, in deviations of the outputs."""
+    errors = np.asarray(free_fit.end.point.errors) / segmented.deviation[:, None]
+    scored = np.moveaxis(np.asarray(segmented.segments.scored), 1, -1).reshape(-1, errors.shape[1])
+    pieces = np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3])
+    return [piece[kept] for piece, kept in zip(pieces, scored, strict=True) if kept.any()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,20 +349,19 @@ class _LateFits:
     number: int
     change: Callable[[Vector, int], Vector]
     """Of an input's values, by so many samples."""
-    tried: dict[int, tuple[float, FreeRunFit]]
-    """What each size leaves, and where it ended; none is there from the start."""
+    tried: dict[int, tuple[SegmentedMotion, FreeRunFit | None]]
+    """Where each size ended; none is there from the start."""
 
-    def leaves(self, samples: int) -> float:
-        """Return the residual of the physics with the input changed by so many samples."""
+    def leaves(self, measure: Measure, samples: int) -> float:
+        """Return what the physics leaves with the input changed by so many samples."""
         if samples not in self.tried:
-            near = self.tried[
-                min(self.tried, key=lambda known: (abs(known - samples), self.tried[known][0]))
-            ][1]
-            problem = self.task.problem
+            ended = [known for known, (_, free_fit) in self.tried.items() if free_fit is not None]
+            near = min(ended, key=lambda known: (abs(known - samples), measure(*self.tried[known])))
+            problem, begin = self.task.problem, self.tried[near][1]
+            assert begin is not None
             late = self._late(problem.record, samples)
-            segmented, free_fit = refit_physics(self.task, near, problem.motion, late, self.solver)
-            self.tried[samples] = residual_of(segmented, free_fit), free_fit or self.tried[0][1]
-        return self.tried[samples][0]
+            self.tried[samples] = refit_physics(self.task, begin, problem.motion, late, self.solver)
+        return measure(*self.tried[samples])
 
     def _late(self, record: Record, samples: int) -> Record:
         """Return the record with the input changed in every experiment."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import Array, jax, jnp, padded_length, quick_jit
-from orthaug.data.record import Record
+from orthaug.data.record import Experiment, Record
 from orthaug.fitting.whiteness import LARGEST
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
@@ -38,6 +38,8 @@ class LinearRun:
     """The experiment's inputs (T, nu) at the same rows."""
     rows: Matrix
     """What the learner's features read beside the states, (T, nr)."""
+    steps: Vector
+    """Seconds (T,) from each row to the next."""
     error: Matrix
     to_state: Float[np.ndarray, "T n0 n0"]
     to_output: Float[np.ndarray, "T ny n0"]
@@ -99,12 +101,10 @@ def linear_runs(model: Model, record: Record, most: int, theta: Vector) -> list[
         first = form.first_row
         if count - first < 2:
             continue
-        part = replace(
-            experiment, inputs=experiment.inputs[:count], outputs=experiment.outputs[:count]
-        )
+        part = experiment.rows(0, count)
         start = model.first_state(part, record)
         rows = np.asarray(form.inputs(part, record))
-        run = _linearize(form, numbers, start, rows, part.outputs[first:], part.inputs[first:])
+        run = _linearize(form, numbers, start, rows, part.rows(first, None), record.sampling_time)
         if run is None:
             return None
         runs.append(run)
@@ -143,7 +143,12 @@ def from_fitted_start(model: Model, record: Record, free_run: Response) -> Respo
 
 
 def _linearize(
-    form: Dynamics, numbers: Numbers, start: Vector, rows: Matrix, outputs: Matrix, inputs: Matrix
+    form: Dynamics,
+    numbers: Numbers,
+    start: Vector,
+    rows: Matrix,
+    part: Experiment,
+    sampling_time: float,
 ) -> LinearRun | None:
     count = len(rows)
     padded = np.pad(rows, ((0, padded_length(count) - count), (0, 0)), mode="edge")
@@ -156,7 +161,8 @@ def _linearize(
         return None
     a, c, b, d = (np.where(np.isfinite(part), part, 0.0) for part in (a, c, b, d))
     read = form.at_samples(numbers, states, rows)
-    return LinearRun(states, inputs, read, outputs - run, a, c, b, d)
+    steps = np.full(count, sampling_time) if part.steps is None else np.asarray(part.steps)
+    return LinearRun(states, part.inputs, read, steps, part.outputs - run, a, c, b, d)
 
 
 @partial(quick_jit, static_argnames="form")

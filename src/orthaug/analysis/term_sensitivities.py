@@ -110,7 +110,8 @@ def sensitivities(
             else None
             for i in equations
         ]
-        columns = _propagate(to_next, to_output, added, at_ends, equations, acting, form)
+        halves = form.durations(u) / 2
+        columns = _propagate(to_next, to_output, added, at_ends, equations, acting, halves, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():
         return None
@@ -170,6 +171,7 @@ def _propagate(
     at_ends: Any,
     equations: Sequence[int],
     acting: Sequence[tuple[Matrix, ...] | None],
+    halves: Matrix,
     form: MotionDynamics,
 ) -> Any:
     """Return the columns (m, T, ny, n0 + n + q) of the outputs, from one row to the next.
@@ -178,9 +180,10 @@ def _propagate(
 
     Args:
         acting: for an input, its slopes (m, T, n0) there.
+        halves: of the seconds (m, T) that each step takes.
     """
     m, steps, n0, own = to_next.shape
-    q, h = len(added), form.sampling_time
+    q = len(added)
     columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
     slope = np.zeros((m, n0, columns.shape[3]))
     slope[:, :, :n0] = np.eye(n0)
@@ -194,6 +197,7 @@ def _propagate(
         slope = a @ slope
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
         now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
+        half = halves[:, k, None, None]
         for place, i in enumerate(equations):
             to, by = slice(own + place * q, own + (place + 1) * q), acting[place]
             if by is not None:
@@ -201,14 +205,14 @@ def _propagate(
                 if form.motion.scheme.discrete:
                     slope[:, :, to] += begin * now[:, None]
                     continue
-                slope[:, :, to] += h / 2 * (a @ begin) * now[:, None]
-                slope[:, :, to] += h / 2 * end * then[:, None]
+                slope[:, :, to] += half * (a @ begin) * now[:, None]
+                slope[:, :, to] += half * end * then[:, None]
                 continue
             if i >= n0:
                 continue
             if form.motion.scheme.discrete:
                 slope[:, i, to] += now
                 continue
-            slope[:, :, to] += h / 2 * a[:, :, i, None] * now[:, None]
-            slope[:, i, to] += h / 2 * then
+            slope[:, :, to] += half * a[:, :, i, None] * now[:, None]
+            slope[:, i, to] += half[:, 0] * then
     return columns

@@ -65,6 +65,10 @@ class MotionField:
         """Return what a step reads of the inputs, and its length over the sampling time."""
         return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
 
+    def durations(self, rows: Any) -> Any:
+        """Return the seconds (…,) that each step takes, of the rows (…, r) that steps read."""
+        return np.broadcast_to(self.sampling_time * self.split_pace(rows)[1], rows.shape[:-1])
+
     def external(self, u: Any) -> Any:
         """Return the record's inputs (external,) of all inputs u (nu,) at a point."""
         return u[len(self.motion.held) :]

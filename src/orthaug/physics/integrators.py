@@ -75,12 +75,14 @@ def _uneven_points(inputs: Matrix, hold: str, substeps: int, pace: Vector) -> Ma
 
 
 def split_pace(row: Any, hold: str, substeps: int, nu: int) -> tuple[Any, Any]:
-    """Return the inputs (points nu,) that a step reads, and its length over that of an even one.
+    """Return the inputs (…, points nu) that a step reads, and its length over that of an even one.
 
     A row of even samples has no pace; the length is then 1.
     """
     points = {"zero-order": 1, "first-order": 2}.get(hold, 2 * substeps + 1)
-    return (row[:-1], 1.0 + row[-1]) if row.shape[0] == points * nu + 1 else (row, 1.0)
+    if row.shape[-1] == points * nu + 1:
+        return row[..., :-1], 1.0 + row[..., -1]
+    return row, 1.0
 
 
 def _interleave(*points: Matrix) -> Matrix:
