@@ -24,7 +24,7 @@ from orthaug.analysis.predictability import BlockSums, Share, SimpleFunctions
 from orthaug.analysis.residuals import rms_errors
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
-from orthaug.data.regressors import lag_matrix
+from orthaug.data.regressors import Layout, lag_matrix
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.models.response import Response, Trajectory
 from orthaug.physics.shared import seen_columns
@@ -224,7 +224,20 @@ class Candidates:
 
     @cached_property
     def functions(self) -> SimpleFunctions:
-        return SimpleFunctions.of(self.fit.problem)
+        problem = self.fit.problem
+        if not self.unread:
+            return SimpleFunctions.of(problem.layout, problem.rows.x)
+        rows = [self._regressor(e, problem.record) for e in problem.record.experiments]
+        return SimpleFunctions.of((*problem.layout, *self.unread), np.concatenate(rows))
+
+    @cached_property
+    def unread(self) -> Layout:
+        """Inputs that nothing of the model reads, of a record in memory."""
+        return () if self.fit.problem.streamed else self.fit.problem.unread_lags
+
+    def _regressor(self, piece: Experiment, record: Record) -> Matrix:
+        """Return what functions may depend on: the regressor, and inputs that nothing reads."""
+        return lag_matrix(piece, (*self.fit.problem.layout, *self.unread), record, self.first)
 
     @cached_property
     def sums(self) -> BlockSums:
@@ -263,8 +276,8 @@ class Candidates:
         Each of the latter is there for every output.
         """
         problem = self.fit.problem
-        x = lag_matrix(piece, problem.layout, record, self.first)
-        phi = problem.phi(x)
+        x = self._regressor(piece, record)
+        phi = problem.phi(x[:, : len(problem.layout)])
         each = np.eye(len(problem.outputs))
         parts = [phi, np.broadcast_to(each, (len(x), *each.shape))]
         if not self.own:
@@ -350,9 +363,11 @@ class Candidates:
         """Return a clause on the inputs that a learner could be given."""
         model, problem = self.fit.model, self.fit.problem
         if not model.learns:
-            return "a learner"
+            seen = ", ".join(map(str, self.unread))
+            return f"a learner that also sees {seen}" if seen else "a learner"
         visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
+        hidden += map(str, self.unread)
         return (
             f"a learner that also sees {', '.join(hidden)}"
             if hidden

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from orthaug._base.checks import check_count, check_type
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import join_words
 from orthaug.analysis.suspects import (
     MotionSuspect,
     Suspect,
@@ -147,12 +148,27 @@ class Evidence:
 def sample_warnings(problem: PosedProblem) -> list[Warning]:
     """Return warnings on training samples that are no measurements.
 
-    Of physics that is linear in θ they say what a fit without them gives.
+    Of physics that is linear in θ they say what a fit without them gives. Inputs that nothing of
+    the model reads are said, too.
     """
+    found = _unread(problem)
     if isinstance(problem, Problem):
-        return list(data_warnings(problem.record, partial(fit_without, problem)))
+        return [*found, *data_warnings(problem.record, partial(fit_without, problem))]
     set_by_controller = problem.motion.held if isinstance(problem, MotionProblem) else ()
-    return list(data_warnings(problem.record, limited=set_by_controller))
+    return [*found, *data_warnings(problem.record, limited=set_by_controller)]
+
+
+def _unread(problem: PosedProblem) -> list[Warning]:
+    """Return a warning on inputs that are recorded for nothing."""
+    if not problem.unread:
+        return []
+    names, one = join_words(problem.unread), len(problem.unread) == 1
+    text = (
+        f"{names} {'is an input' if one else 'are inputs'} of the data, but neither the physics "
+        f"nor the learner reads {'it' if one else 'them'}. Give {'it' if one else 'them'} to the "
+        f"learner, or remove {'it' if one else 'them'} from `data.inputs`."
+    )
+    return [Warning("unread_input", text)]
 
 
 def _problem_of(fit: Estimate) -> Any:

@@ -199,6 +199,8 @@ class LateInputResult(Content):
     declared: Number
     by_lag: bool
     alike: bool
+    ahead: bool = False
+    """True if what is left is what the errors' own past does not predict."""
 
 
 class DiagnosisResult(Content):

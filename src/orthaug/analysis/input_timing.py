@@ -292,9 +292,9 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
         for number in range(len(names))
         for change in (_delay, _lag)
     }
-    for measure in (residual_of, _unpredicted_beside(*declared)):
+    for measure in (residual_of, _unpredicted):
         for number, name in enumerate(names):
-            if name in found or measure is None:
+            if name in found:
                 continue
             delayed, lagged = (
                 partial(fits[number, change].leaves, measure) for change in (_delay, _lag)
@@ -309,27 +309,21 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
     return tuple(found[name] for name in names if name in found)
 
 
-def _unpredicted_beside(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> Measure | None:
-    """Return what measures the part of errors that the past of a fit's errors does not predict.
+def _unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
+    """Return the RMS of what errors' own past does not predict, in deviations of the outputs.
 
-    Slow disturbances leave errors beside which an input's delay is small, but sudden. Those are
-    filtered by the autoregression of the errors as they were.
+    Slow disturbances leave errors beside which an input's delay is small, but sudden. inf without
+    a run, or where an output is missing on a row.
     """
     if free_fit is None or not segmented.record.complete:
-        return None
+        return float("inf")
     pieces = _errors(segmented, free_fit)
     outputs = range(pieces[0].shape[1])
-    colours = [whitening_filter([piece[:, o] for piece in pieces]) for o in outputs]
-    known = [np.ones(1) if colour is None else colour for colour in colours]
-
-    def unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
-        if free_fit is None:
-            return float("inf")
-        rows = [filter_rows(piece[..., None], known) for piece in _errors(segmented, free_fit)]
-        value = float(np.sqrt(np.mean(np.concatenate(rows) ** 2)))
-        return value if np.isfinite(value) else float("inf")
-
-    return unpredicted
+    found = [whitening_filter([piece[:, o] for piece in pieces]) for o in outputs]
+    colours = [np.ones(1) if colour is None else colour for colour in found]
+    rows = [filter_rows(piece[..., None], colours) for piece in pieces]
+    value = float(np.sqrt(np.mean(np.concatenate(rows) ** 2)))
+    return value if np.isfinite(value) else float("inf")
 
 
 def _errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> list[Matrix]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.residuals import errors_of
+from orthaug.data.regressors import Layout
 from orthaug.fitting.whiteness import Pieces, pieces_of
 from orthaug.inference.covariance import by_experiment
 from orthaug.models.response import Response
@@ -38,12 +39,12 @@ class SimpleFunctions:
     variables: tuple[tuple[Vector, float, float], ...]
 
     @classmethod
-    def of(cls, problem: Problem) -> SimpleFunctions:
-        """Return the functions for the regressors of physics and learner.
+    def of(cls, layout: Layout, x: Matrix) -> SimpleFunctions:
+        """Return the functions for regressors (N, n).
 
         First lags and differences of all channels come first.
         """
-        layout, x, each = problem.layout, problem.rows.x, np.eye(len(problem.layout))
+        each = np.eye(len(layout))
         places: dict[str, list[int]] = {}
         for j, lag in enumerate(layout):
             places.setdefault(lag.channel, []).append(j)
@@ -219,7 +220,8 @@ def predictable(
     Args:
         simulates: a free run, whose errors are no function of the regressor.
     """
-    errors, functions, found = errors_of(response, skip), SimpleFunctions.of(problem), []
+    errors, found = errors_of(response, skip), []
+    functions = SimpleFunctions.of(problem.layout, problem.rows.x)
     starts = [run.start + skip for run in response.trajectories]
     inputs = [e.inputs[a:] for e, a in zip(problem.record.experiments, starts, strict=True)]
     x = np.concatenate([piece[skip:] for piece in by_experiment(problem, problem.rows.x)])

@@ -48,6 +48,9 @@ class Proposal:
     """A parameter that has to be positive, such as the size of a dead zone."""
     step: Any = None
     """Step of preparation that the change adds: the rows of the trial have the others already."""
+    ahead: tuple[float, float] | None = None
+    """What errors' past does not predict of them, without the change and with it, where that shows
+    it: beside slow disturbances its gain in a free run is hidden."""
 
     def accepts(self, fit: Any) -> bool:
         """Return whether the result of a changed spec agrees with the words of the proposal."""
@@ -66,8 +69,11 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
         return _unique_proposals(
             list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
         )
+    late = list(_late_inputs(job, result))
+    if any(proposal.ahead for proposal in late):  # beside it other causes are mistaken
+        return _unique_proposals([proposal for proposal in late if proposal.ahead])
     found = [
-        *_late_inputs(job, result),
+        *late,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
@@ -95,7 +101,9 @@ def _late_inputs(job: Job, result: FitResult) -> Iterator[Proposal]:
     for late in result.residuals.late if result.residuals is not None else ():
         kinds = (_lag, _delay) if late.by_lag else (_delay, _lag)
         for kind in kinds if late.alike else kinds[:1]:
-            yield from kind(job, late)
+            after = late.lagged if kind is _lag else late.delayed
+            shown = (float(late.declared or 0.0), float(after or 0.0)) if late.ahead else None
+            yield from (replace(proposal, ahead=shown) for proposal in kind(job, late))
 
 
 def _lag(job: Job, late: LateInputResult) -> Iterator[Proposal]:
@@ -208,6 +216,13 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     from orthaug.physics.shared import seen_columns
 
     spec, problem, bound = job.spec, job.problem, fit.model.form.bound
+    unread = [str(lag) for lag in problem.unread_lags]
+    if unread:
+        now = spec.learner_inputs() or [str(lag) for lag in problem.layout]
+        new = {"learner.inputs": [*now, *unread]}
+        change = {"learner": {"kind": "mlp"}} if spec.declared_learner() is None else {}
+        words = f"a learner that also sees {join_words(unread)}"
+        yield Proposal(words, change | new, learns=True)
     if spec.declared_learner() is None:
         yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
         return
@@ -468,7 +483,7 @@ def _conclude_trials(
         one
         for one in tried
         if one.pieces is not None
-        and _ratio(one.pieces, base).code == "helps"
+        and (one.proposal.ahead is not None or _ratio(one.pieces, base).code == "helps")
         and not (one.error > _NO_BETTER and (poor or one.error > _TAMED * before))
     ]
     better: list[ProposalErrors] = []
@@ -533,6 +548,14 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
         return (
             f"{text} no longer diverges: its error is {_error(one.error)} of the output's "
             "deviation."
+        )
+    if one.proposal.ahead is not None:
+        declared, after = map(_error, one.proposal.ahead)
+        return (
+            f"With {one.proposal.words} what the past does not predict of the error of physics "
+            f"alone falls from {declared} to {after} of the output's deviation. Beside slow disturbances "
+            f"the free run hardly shows it: {_error(before)} before, {_error(one.error)} after, on "
+            f"{rows.where}. Fit with it first: other causes show then."
         )
     return (
         f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."

@@ -72,6 +72,11 @@ class ClosedLoop(Motion):
     def around(self, plant: Motion) -> ClosedLoop:
         return close_loop(plant, self.controller, self.external, [o.name for o in self.outputs])
 
+    @property
+    def unread(self) -> tuple[str, ...]:
+        read = {name for e in (*dict(self._law[0]).values(), *self._law[1]) for name in e.names}
+        return tuple(name for name in super().unread if name not in read)
+
     @cached_property
     def _readable(self) -> dict[str, float]:
         """Names that the controller's expressions may use, beside definitions and outputs."""

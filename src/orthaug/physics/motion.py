@@ -472,6 +472,12 @@ class Motion(NotebookView):
         return tuple(name for name in self.external if name in self.visible)
 
     @property
+    def unread(self) -> tuple[str, ...]:
+        """Names of the record's inputs that no expression reads; none where there is none."""
+        read = set().union(*self._read) if self.functions is None else set(self.external)
+        return tuple(name for name in self.external if name not in read)
+
+    @property
     def plant(self) -> Motion:
         """The motion without a controller around it."""
         return self

@@ -87,6 +87,11 @@ class PosedProblem:
         return False
 
     @property
+    def unread(self) -> tuple[str, ...]:
+        """Names of inputs that neither the physics nor a learner reads; none where unknown."""
+        return ()
+
+    @property
     def derived_units(self) -> dict[str, str]:
         """Units of parameters that follow from those of the channels."""
         return {}
@@ -246,6 +251,20 @@ class Problem(PosedProblem):
         """The raw lags that the physics or the learner reads."""
         read = {*self.baseline.lags, *self.features.lags}
         return tuple(lag for lag in self.layout if lag in read)
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        if self.baseline.function is not None:
+            return ()
+        read = {lag.channel for lag in self.used}
+        return tuple(c.name for c in self.record.inputs if c.name not in read)
+
+    @property
+    def unread_lags(self) -> Layout:
+        """The inputs that nothing reads, at the smallest lag of the others."""
+        inputs = [c.name for c in self.record.inputs]
+        delays = [lag.lag for lag in self.layout if lag.channel in inputs]
+        return tuple(Lag(name, min(delays, default=0)) for name in self.unread)
 
     @property
     def whitened_target(self) -> Float[np.ndarray, "N ny"]:
@@ -471,6 +490,11 @@ class MotionProblem(GuessedMotion, PosedProblem):
     """A record with its motion; `features` are what a learner sees."""
 
     features: tuple[Expression, ...]
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        seen = {name for feature in self.features for name in feature.names}
+        return tuple(name for name in self.motion.unread if name not in seen)
 
     new_state: ClassVar[str] = "write the state out as a state of the motion with its own equation"
 
