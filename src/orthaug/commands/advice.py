@@ -553,8 +553,8 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
         declared, after = map(_error, one.proposal.ahead)
         return (
             f"With {one.proposal.words} what the past does not predict of the error of physics "
-            f"alone falls from {declared} to {after} of the output's deviation. Beside slow disturbances "
-            f"the free run hardly shows it: {_error(before)} before, {_error(one.error)} after, on "
+            f"alone falls from {declared} to {after} of the output's deviation. Beside slow "
+            f"disturbances the free run hardly shows it: {_error(before)} before, {_error(one.error)} after, on "
             f"{rows.where}. Fit with it first: other causes show then."
         )
     return (
