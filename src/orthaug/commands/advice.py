@@ -554,8 +554,9 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
         return (
             f"With {one.proposal.words} what the past does not predict of the error of physics "
             f"alone falls from {declared} to {after} of the output's deviation. Beside slow "
-            f"disturbances the free run hardly shows it: {_error(before)} before, {_error(one.error)} after, on "
-            f"{rows.where}. Fit with it first: other causes show then."
+            f"disturbances the free run hardly shows it: {_error(before)} before, "
+            f"{_error(one.error)} after, on {rows.where}. Fit with it first: other causes show "
+            "then."
         )
     return (
         f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
