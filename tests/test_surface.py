@@ -267,3 +267,21 @@ def test_a_misspelt_name_is_answered_with_the_nearest():
     with pytest.raises(AttributeError, match="has no attribute 'qqq'"):
         oa.qqq  # noqa: B018
     assert not hasattr(oa, "__wrapped__")
+
+
+def test_docstrings_for_users_cite_no_label_without_its_source():
+    label = re.compile(r"\((?:eq:\w+|[FS]\d+)\)|^\s*Φ⁺Y\b", re.MULTILINE)
+    faces = [getattr(oa, name) for name in dir(oa) if not name.startswith("_")]
+    members = [
+        inspect.getattr_static(face, name)
+        for face in faces
+        if inspect.isclass(face)
+        for name in dir(face)
+        if not name.startswith("_")
+    ]
+    bare = {
+        getattr(one, "__qualname__", one)
+        for one in [*faces, *members]
+        if label.search(inspect.getdoc(one) or "")
+    }
+    assert not bare
