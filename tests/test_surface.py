@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +52,16 @@ def test_arguments_of_read_record(file, name):
         tried(lambda value: read_record(file, **{"inputs": ["u"], "outputs": ["y"], name: value}))
         >= 18
     )
+
+
+def test_rows_without_a_step_are_said_to_be_a_second_apart(file):
+    with pytest.warns(UserWarning, match="1 s apart. Give `sampling_time` in seconds") as found:
+        read_record(file, inputs=["u"], outputs=["y"])
+    assert found[0].filename == __file__
+    for option in ({"sampling_time": 0.1}, {"time": "t"}):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read_record(file, inputs=["u"], outputs=["y"], **option)
 
 
 def test_paths_of_read_record():

@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence, Set
 from contextlib import suppress
 from pathlib import Path
@@ -253,6 +254,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the 
 
 def main() -> None:
     """Run the command and turn errors into one line and an exit code."""
+    warnings.filterwarnings("ignore", "the rows of .* are taken to be 1 s apart")  # for Python
     try:
         code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()

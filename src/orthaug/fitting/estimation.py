@@ -115,8 +115,8 @@ def estimate(
     The criterion is the mean square of the prediction error, or of the error of a free run.
 
     θ is solved, never iterated: with the orthogonal structure it is the least-squares fit of
-    physics alone, whatever the learner does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
-    physics nearest to the fitted motion.
+    physics alone, whatever the learner does. Equations of motion (`Motion`) are fitted on their
+    free run, and their parameters are the physics nearest to the fitted motion.
 
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay

@@ -33,7 +33,8 @@ def orthogonalize(
 
     Returns:
         An estimate whose model predicts what `function` does: θ is the least-squares fit of the
-        physics to it, and the learner what that leaves, `g − φθ`. There are no standard errors: they belong to how `function` was trained.
+        physics to it, and the learner what that leaves, `g − φθ`. There are no standard errors:
+        they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
