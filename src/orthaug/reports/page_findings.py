@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from orthaug.analysis.residual_tests import ResidualTestResult
+from orthaug.reports.biases import REMOVED_BY
 from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent, with_unit
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
 from orthaug.reports.result import FitResult
@@ -147,10 +148,7 @@ def excitation_blocks(result: FitResult) -> list[Any]:
         ]
         caption = "Terms that may be missing from the physics."
         if any(s.removed_by for s in result.bias):
-            caption = (
-                "Terms that may be missing from the physics, and what removes their bias from "
-                "the parameters."
-            )
+            caption += f" {REMOVED_BY}"
             head = [*head, "removed by"]
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:

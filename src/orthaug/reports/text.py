@@ -23,7 +23,7 @@ from orthaug._base.lines import (
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.findings import SharedResult, SuspectResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
-from orthaug.reports.biases import biased_by
+from orthaug.reports.biases import REMOVED_BY, biased_by
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
@@ -126,9 +126,7 @@ def check_text(result: CheckResult) -> str:
         lines += [
             "",
             "Bias of each parameter if a term is missing from the physics. Size: its share of "
-            "the output's deviation, 1 % where no coefficient is given. Removed by: a measure, "
-            "if some weighting of these points leaves none; the learner, if it sees the term, "
-            "from what it could not imitate.",
+            f"the output's deviation, 1 % where no coefficient is given. {REMOVED_BY}",
             *_suspect_lines(result.bias),
         ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
