@@ -514,4 +514,7 @@ def test_a_narrow_table_keeps_a_share_with_its_term():
     rows = [line for line in lines if line[:4] in ("57.4", "90 %")]
     begins = ("90 %   position  position[k-1]*", "90 %   angle     position[k-1]*")
     assert [any(row.startswith(begin) for row in rows) for begin in begins] == [True, True]
-    assert rows[-1].startswith("57.4 %  position  a friction-like hysteresis (LuGre)") and len(rows) == 3
+    assert (
+        rows[-1].startswith("57.4 %  position  a friction-like hysteresis (LuGre)")
+        and len(rows) == 3
+    )
