@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,9 @@ from orthaug.commands.program import (
     print_result,
 )
 from orthaug.commands.signals import WATCH
+
+if TYPE_CHECKING:
+    from orthaug.commands.fit import FitReport
 
 __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
@@ -117,8 +120,14 @@ def fit(
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, job.problem.count
     takes_a_while = learns or job.spec.motion is not None
+
+    def keep_finished(finished: FitReport) -> None:
+        WATCH.rescue = partial(write_result, finished, folder, force=force)
+
     with training_bar(job.run_count, job.iterations, takes_a_while, rows) as progress:
-        fitted = fit_job(job, progress)
+        before = WATCH.rescue
+        fitted = fit_job(job, progress, keep_finished)
+        WATCH.rescue = before
     if other_writes():
         return
     write_result(fitted, folder, force=force)
