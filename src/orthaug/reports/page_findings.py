@@ -121,7 +121,8 @@ def stability_blocks(result: FitResult) -> list[Any]:
 def excitation_blocks(result: FitResult) -> list[Any]:
     """Return how well the data identify the parameters, and the bias by each suspected term."""
     seen = result.excitation
-    text = f"The data identify {seen.rank} of {seen.columns} parameters; "
+    alone = "Without a learner the" if result.learns else "The"
+    text = f"{alone} data determine {seen.rank} of {seen.columns} parameters; "
     text += f"the condition number is {number(seen.condition, 3)}."
     if result.orthogonality_defect is not None:
         small = result.orthogonality_defect < 1e-10
