@@ -222,7 +222,7 @@ def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(
     (low, high), text = found.of("a").ci95, found.warnings[0].text
     assert low < 0.9 < high
     if missing == "tanh":
-        assert text.startswith("tanh(y[k-1], 0.4") and found.share > 0.99  # its width is profiled
+        assert text.startswith("tanh(y[k-1]/0.4") and found.share > 0.99  # its width is profiled
     elif missing == "drag":  # was called power(y[k-1], 2), as a square would be
         assert text.startswith("y[k-1]*abs(y[k-1]) explains") and found.share > 0.99
         assert "write y[k-1]*abs(y[k-1]) into the physics" in text

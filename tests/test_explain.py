@@ -487,7 +487,7 @@ def test_an_end_stop_or_a_limit_of_a_spring_leaves_it_its_stiffness(slope):
 
 
 def test_a_narrow_table_keeps_a_share_with_its_term():
-    long = "a bristle of LuGre friction of position[k-1] and of angle, width 0.0056"
+    long = "a friction-like hysteresis (LuGre) of position[k-1] and of angle, width 0.0056"
     wide = "position[k-1]*position[k-2] + position[k-1]*position[k-3] + angle"
     memory = MemoryResult(
         name=long, kind="lugre", on="x", scale=1.0, equation="position", share=0.574, p=0.0
@@ -514,4 +514,7 @@ def test_a_narrow_table_keeps_a_share_with_its_term():
     rows = [line for line in lines if line[:4] in ("57.4", "90 %")]
     begins = ("90 %   position  position[k-1]*", "90 %   angle     position[k-1]*")
     assert [any(row.startswith(begin) for row in rows) for begin in begins] == [True, True]
-    assert rows[-1].startswith("57.4 %  position  a bristle of LuGre friction") and len(rows) == 3
+    assert (
+        rows[-1].startswith("57.4 %  position  a friction-like hysteresis (LuGre)")
+        and len(rows) == 3
+    )

@@ -1162,5 +1162,11 @@ def test_under_feedback_no_input_acts_in_its_own_row(tmp_path):
     assert "past outputs predict u: the data were probably recorded under feedback" in unfolded(
         done.out
     )
-    regressors = re.findall(r'regressor = "(.*?)"', (tmp_path / "spec.toml").read_text())
+    spec = (tmp_path / "spec.toml").read_text()
+    regressors = re.findall(r'regressor = "(.*?)"', spec)
     assert "u[k]" not in regressors and "y[k-2]" in regressors
+    assert '# output = "u"' in spec and '# reference = "reference"' in spec
+    frame.assign(setpoint=reference).to_csv(tmp_path / "b.csv", index=False)
+    columns = ("--inputs", "u", "--outputs", "y", "--out", tmp_path / "second.toml")
+    assert run("init", tmp_path / "b.csv", *columns).code == 0
+    assert '# reference = "setpoint"' in (tmp_path / "second.toml").read_text()

@@ -16,6 +16,7 @@ from orthaug.analysis.findings import (
 from orthaug.analysis.fit_findings import ParameterResult, PartScores, ScoreResult, StatusResult
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
+from orthaug.reports.text import compare_text
 
 DATA = DataResult(train=[], tests={"far": []})
 STATUS = StatusResult(
@@ -180,3 +181,11 @@ def test_of_models_that_are_as_good_the_one_whose_parameters_mean_something_is_t
     )
     lower = compare_verdict(compared(alone, row("additive", 0.1), row("orthogonal", 0.105)))
     assert "the smallest of all models" not in lower.trust
+
+
+def test_the_terminal_ends_with_the_verdict_that_the_page_begins_with():
+    result = compared(row("orthogonal", 0.05), row("physics alone", 0.3))
+    verdict = compare_verdict(result)
+    last = compare_text(result.model_copy(update={"differences": None}), {}).split("\n\n")[-1]
+    assert " ".join(last.split()) == f"Verdict: {verdict.trust} {verdict.use}"
+    assert verdict.trust.startswith("Take “orthogonal”: the RMS error of its free run")

@@ -157,7 +157,11 @@ def test_an_interrupted_rehearsal_goes_on(static):
     )
     first = run(*arguments)
     assert first.code == 0, first.err
+    assert "rehearsal: 3 fits for 3 draws. They take " in first.err
     *lines, last = first.out.splitlines()
+    said = " ".join(lines)
+    for head in ("held: ", "with bias: ", "silent: ", "bias: ", "width: ", "2 N: "):
+        assert head in said, head
     assert last.startswith("written to") and max(map(len, lines)) <= 80
     kept = json.loads((out / "recover.json").read_text())
     assert (out / "figures" / "recovery.png").stat().st_size > 5000

@@ -14,6 +14,7 @@ from test_cli import finite_json, one_line, run
 import orthaug as oa
 from orthaug.data.terms import TermLibrary
 from orthaug.physics.problem import pose
+from orthaug.reports.selection import SelectResult, selection_text
 from orthaug.selection.candidates import SHORTLIST, candidates
 from orthaug.selection.forward import Equations, forward
 from orthaug.selection.nonlinearity import nonlinearity
@@ -503,6 +504,37 @@ def test_select_from_the_shell_leaves_a_spec_that_runs(project, tmp_path, withou
         content["equation"]["text"].startswith("y[k] = ")
         and r"y_{k} = " in content["equation"]["latex"]
     )
+
+
+@pytest.mark.parametrize(
+    ("p", "learner", "said"),
+    [
+        (0.75, {"kind": "mlp", "hidden": [1]}, "A network is chosen all the same"),
+        (0.75, {"kind": "terms", "terms": ["y[k-1]"]}, ""),
+        (0.75, {"kind": "terms", "terms": ["y[k-1]**2"]}, "Terms are chosen all the same"),
+        (0.01, {"kind": "mlp", "hidden": [1]}, ""),
+    ],
+)
+def test_the_page_names_the_unit_of_its_errors_and_why_a_nonlinear_learner_is_chosen(
+    p, learner, said
+):
+    stages = (("orders", 2, 0.03), ("learner", 0, 0.6), ("learner", 6, 0.031))
+    rows = [
+        {"stage": stage, "model": "m", "size": size, "score": score, "chosen": size > 0}
+        | {"standard_error": 0.001, "within": True, "seconds": 1.0}
+        for stage, size, score in stages
+    ]
+    test = {"p": p, "regressors": {"y[k-1]": p}, "matter": [], "text": "nothing is found."}
+    content = {"orders": {"na": 1, "nb": [1], "nk": [1]}, "nonlinearity": test, "models": rows}
+    content |= {"data": {"train": []}, "delays": [], "learner": learner, "focus": "simulation"}
+    content |= {"terms": None, "intervals": {"source": "none", "text": "none."}, "level": 0.05}
+    content |= {"seconds": 1.0, "stopped": False, "warnings": []}
+    page = " ".join(
+        selection_text(SelectResult.model_validate(content), oa.Channel("y", "mm")).split()
+    )
+    assert "error: root mean square error of y in free runs, in mm, on blocks" in page
+    assert ("all the same" in page) == bool(said) and said in page
+    assert ("from 0.6 mm to 0.031 mm. Linear lags alone reach 0.03 mm" in page) == bool(said)
 
 
 def test_select_of_halves_fits_the_other_rows(project, tmp_path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +52,16 @@ def test_arguments_of_read_record(file, name):
         tried(lambda value: read_record(file, **{"inputs": ["u"], "outputs": ["y"], name: value}))
         >= 18
     )
+
+
+def test_rows_without_a_step_are_said_to_be_a_second_apart(file):
+    with pytest.warns(UserWarning, match="1 s apart. Give `sampling_time` in seconds") as found:
+        read_record(file, inputs=["u"], outputs=["y"])
+    assert found[0].filename == __file__
+    for option in ({"sampling_time": 0.1}, {"time": "t"}):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read_record(file, inputs=["u"], outputs=["y"], **option)
 
 
 def test_paths_of_read_record():
@@ -267,3 +280,21 @@ def test_a_misspelt_name_is_answered_with_the_nearest():
     with pytest.raises(AttributeError, match="has no attribute 'qqq'"):
         oa.qqq  # noqa: B018
     assert not hasattr(oa, "__wrapped__")
+
+
+def test_docstrings_for_users_cite_no_label_without_its_source():
+    label = re.compile(r"\((?:eq:\w+|[FS]\d+)\)|^\s*Φ⁺Y\b", re.MULTILINE)
+    faces = [getattr(oa, name) for name in dir(oa) if not name.startswith("_")]
+    members = [
+        inspect.getattr_static(face, name)
+        for face in faces
+        if inspect.isclass(face)
+        for name in dir(face)
+        if not name.startswith("_")
+    ]
+    bare = {
+        getattr(one, "__qualname__", one)
+        for one in [*faces, *members]
+        if label.search(inspect.getdoc(one) or "")
+    }
+    assert not bare

@@ -111,6 +111,33 @@ def test_a_signal_while_a_folder_is_written(tmp_path, number, words):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_signal_during_the_trials_leaves_the_finished_fit(tmp_path):
+    make_project(tmp_path)
+    program = (
+        "import sys, time; import orthaug.commands.advice as advice\n"
+        "def wait(*_):\n    print('ready', flush=True); time.sleep(100)\n"
+        "advice.advise = wait\nsys.argv = ['orthaug', 'fit', 'plant.toml', '--out', 'out']\n"
+        "from orthaug.commands.entry import main\nmain()\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGTERM)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 128 + signal.SIGTERM and "; out is written" in err
+    result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
+    assert result["parameters"] and result["advice"] == [] and result["advice_trials"] is None
+    assert (tmp_path / "out" / "model").is_dir() and (tmp_path / "out" / "report.html").is_file()
+
+
 # --- in this process
 
 

@@ -18,6 +18,7 @@ from typer.main import get_command
 from orthaug._base.lines import WIDTH, estimate_cells, fit_screen, fold, table
 from orthaug._base.progress import LOG, show_log
 from orthaug.commands import bars, program, streams
+from orthaug.inference.kinds import MEASURES
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -56,6 +57,15 @@ def test_help_fits():
     names = ("fit", "predict", "track", "linearize", "reproduce")
     for arguments in (("--help",), *((name, "--help") for name in names)):
         assert fits(run(*arguments).out)
+
+
+def test_help_names_arguments_as_one_types_them():
+    for name in (name for names in program.GROUPS.values() for name in names):
+        shown = run(name, "--help").out
+        assert not re.search(r"[{}]|\[\[[A-Z]|<\w+|\.\.\.\]\.\.\.", shown), name
+    assert "MODEL DATA...\n" in run("split", "--help").out
+    for kind in MEASURES:
+        assert kind in run("split", "--help").out
 
 
 def test_help_cuts_no_line_of_a_command(monkeypatch):

@@ -56,6 +56,7 @@ from orthaug.physics.parameters import PhysicsMap
 
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _ALIKE = 1e-6  # of a bias
+_SAME = 1e-3  # of a share: terms that differ less are one term by two names
 _WHOLE = 0.95  # of what the learner found: a cause that may stand in its place
 _LISTED = 4  # parameters that a warning lists at most
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
@@ -554,11 +555,15 @@ def _biased_warning(
     cure = " or ".join([*(_as_physics(causes) if learns else ()), *remedies])
     where = "" if causes.output is None else f" in {causes.output}"
     listed, moves = " and ".join(map(_describe_cause, causes.entries)), list_biases(large)
-    first = sorted(causes.rivals, key=lambda entry: entry.share, reverse=True)[:2]
+    rivals = sorted(causes.rivals, key=lambda entry: entry.share, reverse=True)
+    first = _drop_same(causes, rivals)[:2]
     named = " and ".join(f"{rival.suspect.name}, {percent(rival.share)}" for rival in first)
     other = f" (close to it: {named}, which would imply other values)" if first else ""
     if learns and causes.share < SURE_SHARE:
-        near = ", ".join(f"{entry.suspect.name} {percent(entry.share)}" for entry in causes.near)
+        near = ", ".join(
+            f"{entry.suspect.name} {percent(entry.share)}"
+            for entry in _drop_same(causes, causes.near)
+        )
         beside = f"; next: {near}" if near else ""
         return Warning(
             "biased",
@@ -573,6 +578,19 @@ def _biased_warning(
         f"move{'' if several else 's'} {moves}. The standard errors do not cover this "
         f"bias{other}{f'. Remedy: {cure}' if cure else ''}.",
     )
+
+
+def _drop_same(causes: Causes, others: Sequence[SuspectedBias]) -> list[SuspectedBias]:
+    """Return the terms without those that are a cause, or an earlier term, by another name."""
+    found: list[SuspectedBias] = []
+    for one in others:
+        known = (*causes.entries, *found)
+        if not any(
+            one.equation == other.equation and abs(one.share - other.share) < _SAME * other.share
+            for other in known
+        ):
+            found.append(one)
+    return found
 
 
 def _as_physics(causes: Causes) -> tuple[str, ...]:

@@ -241,7 +241,8 @@ def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
             text = family.text(x, w)
             text = text if whole else text.replace(f"({x})", x)
-            yield f"{family.name}({on}, {w})" if family.scaled else text, text
+            named = text.startswith(f"{family.name}(") or not family.scaled  # as tanh(v/0.5) is
+            yield text if named else f"{family.name}({on}, {w})", text
 
 
 def saturations(suspects: Sequence[Suspect]) -> list[Suspect]:

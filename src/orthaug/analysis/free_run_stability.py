@@ -96,12 +96,10 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
     run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
         steepest = checks.lipschitz.gradient
-        gradient = (
-            "no finite gradient" if steepest is None else f"a gradient of at most {steepest:.4g}"
-        )
+        gradient = "without bound" if steepest is None else f"by up to {steepest:.4g} times as much"
         yield (
-            f"The one-step predictor has {gradient} on measured rows; that says nothing about "
-            "the free run.",
+            f"On measured rows a change of past values moves the one-step prediction {gradient}; "
+            "the free run is judged apart from that.",
             "",
         )
     if run is None:

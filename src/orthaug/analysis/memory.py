@@ -17,7 +17,7 @@ KINDS = ("lag", "backlash", "lugre", "bouc_wen")
 WORDS = {
     "lag": "first-order lag",
     "backlash": "backlash (play)",
-    "lugre": "bristle of LuGre friction",
+    "lugre": "friction-like hysteresis (LuGre)",
     "bouc_wen": "Bouc-Wen hysteresis",
 }
 TIME_CONSTANTS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)  # samples

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,9 @@ from orthaug.commands.program import (
     print_result,
 )
 from orthaug.commands.signals import WATCH
+
+if TYPE_CHECKING:
+    from orthaug.commands.fit import FitReport
 
 __all__ = ["main"]
 _LARGE = 20e6  # bytes of a data file from which on `init` reports its stage
@@ -117,8 +120,14 @@ def fit(
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, job.problem.count
     takes_a_while = learns or job.spec.motion is not None
+
+    def keep_finished(finished: FitReport) -> None:
+        WATCH.rescue = partial(write_result, finished, folder, force=force)
+
     with training_bar(job.run_count, job.iterations, takes_a_while, rows) as progress:
-        fitted = fit_job(job, progress)
+        before = WATCH.rescue
+        fitted = fit_job(job, progress, keep_finished)
+        WATCH.rescue = before
     if other_writes():
         return
     write_result(fitted, folder, force=force)
@@ -139,7 +148,7 @@ def compare(
     what: Annotated[
         list[Path],
         typer.Argument(
-            metavar="SPEC|RESULT",
+            metavar="SPEC|RESULT...",
             help="A spec file, or the result folders of two fits or more.",
         ),
     ],
@@ -303,7 +312,7 @@ def recover(
     draw_folder.check(job)
     prepare_jax()
     with study_bars() as progress:
-        made = rehearse(job, asked, draw_folder, partial(progress, "rehearsal"))
+        made = rehearse(job, asked, draw_folder, partial(progress, "rehearsal"), streams.say)
     write(made, folder)
     print_result(made.result, recover_text(made.result), as_json, folder)
 
@@ -332,8 +341,9 @@ def select(
     with selection_bar(steps_at_most(given.selection.terms)) as report_model:
         selected = select_for(job, given, folder, report_model)
     write_selected(selected, folder, force=force)
+    output = selected.job.train.record.outputs[0]
     place = f"{folder}\nnext: orthaug fit {folder / 'spec.toml'}"
-    print_result(selected.result, selection_text(selected.result), as_json, place)
+    print_result(selected.result, selection_text(selected.result, output), as_json, place)
 
 
 @app.command(
@@ -457,7 +467,7 @@ def page(
     spec: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[SPEC]", help="Spec to start with; it is not changed.", show_default="none"
+            metavar="SPEC", help="Spec to start with; it is not changed.", show_default="none"
         ),
     ] = None,
     port: Annotated[
@@ -482,7 +492,7 @@ def schema(
     command: Annotated[
         str,
         typer.Argument(
-            metavar="[WHAT]",
+            metavar="WHAT",
             help="A command with --json: what it writes; error: what it prints where it fails; "
             "spec: a spec file; keys: every key of a spec, in words.",
         ),
@@ -501,7 +511,7 @@ def schema(
 @app.command(epilog="Example: orthaug reproduce --small")
 def reproduce(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="One study.", show_default="all")
+        str | None, typer.Argument(metavar="NAME", help="One study.", show_default="all")
     ] = None,
     out: Annotated[Path | None, out_folder("orthaug-out/reproduction")] = None,
     pipeline: Annotated[
@@ -555,7 +565,7 @@ def reproduce(
 def benchmark(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Sets to measure.", show_default="all"),
+        typer.Argument(metavar="NAME...", help="Sets to measure.", show_default="all"),
     ] = None,
     data: Annotated[
         Path | None,

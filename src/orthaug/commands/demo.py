@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from orthaug._base.folders import whole_folder
-from orthaug._base.lines import estimate_cells, fold, table
+from orthaug._base.lines import estimate_cells, fold, percent, table
 from orthaug._base.progress import SILENT, Progress
 from orthaug.commands.fit import FitReport, fill_result, fit_job
 from orthaug.commands.opening import open_job
@@ -112,8 +112,8 @@ def _comparison(example: Example, orthogonal: FitReport, additive: list[LaggedEs
         spread = f"{thetas[:, i].min():.4g} … {thetas[:, i].max():.4g}"
         true = f"{example.theta[i]:.6g}"
         rows.append([parameter.name, true, f"{parameter.initial:.4g}", f"{value} ± {std}", spread])
-    errors = [np.linalg.norm((t - example.theta) / example.theta) for t in thetas]
-    error = np.linalg.norm((fit.theta - example.theta) / example.theta)
+    errors = [float(np.linalg.norm((t - example.theta) / example.theta)) for t in thetas]
+    error = float(np.linalg.norm((fit.theta - example.theta) / example.theta))
     spread = f"{min(errors):.4g} … {max(errors):.4g}"
     rows.append(["relative error of θ", "", "", f"{error:.4g}", spread])
     for label, verb in (
@@ -131,8 +131,9 @@ def _comparison(example: Example, orthogonal: FitReport, additive: list[LaggedEs
     ]
     lines += [
         "",
-        "Both predict equally well; only the orthogonal structure keeps θ (‖QᵀF̃‖/‖F‖ = "
-        f"{fit.defect:.0e}).",
+        "From every start the orthogonal θ is that of least squares, with an error of "
+        f"{percent(error)}. The additive θ depends on the start: its error is "
+        f"{percent(min(errors))} to {percent(max(errors))}.",
     ]
     lines += [
         f"warning: {warning.text}"

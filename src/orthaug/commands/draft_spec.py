@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,6 +22,7 @@ from orthaug.selection.first_orders import FirstModel
 
 FILLED = 3
 """Rows of a gap that the spec's step `fill` reconstructs at most."""
+_REFERENCE = re.compile(r"ref(erence)?|r|set_?point|target|desired|demand|soll\w*", re.IGNORECASE)
 CLEARLY = "first significant at lag {}; from here on it runs clearly better on rows held out"
 
 
@@ -121,10 +123,12 @@ def spec_text(
     named: tuple[list[str], list[str]],
     model: FirstModel,
     motion: Motion | None = None,
+    controlled: Sequence[str] = (),
 ) -> str:
     """Return the spec with comments; `gaps` says which rows will be left out, "" for none.
 
-    The physics is `motion`, or else the first model.
+    `controlled` are inputs that a controller seems to set. The physics is `motion`, or else the
+    first model.
     """
     document = tomlkit.document()
     document.add(
@@ -160,7 +164,33 @@ def spec_text(
     training = tomlkit.table()
     training.add("restarts", 3)
     document.add("training", training)
+    if controlled:
+        document.add(tomlkit.nl())
+    for line in _controller_lines(found, roles, controlled):
+        document.add(tomlkit.comment(line))
     return tomlkit.dumps(document)
+
+
+def _controller_lines(found: Survey, roles: Roles, controlled: Sequence[str]) -> list[str]:
+    """Return how to declare the controller that seems to set inputs; nothing for none."""
+    if not controlled:
+        return []
+    set_by_it, output = controlled[0], channel_names(roles.outputs)[0]
+    used = {id(column) for column in (*roles.inputs, *roles.outputs)}
+    named = [c.name for c in found.signals if _REFERENCE.fullmatch(c.name)]
+    unused = [c.name for c in found.signals if id(c) not in used and c.name in named]
+    reference = next(iter([*unused, *named]), "reference")
+    return [
+        f"Past outputs predict {join_words(controlled)}, as under feedback. Beside equations of "
+        "motion",
+        "([motion] instead of [baseline]) the controller can be declared, so that the loop is "
+        "simulated:",
+        "[controller]",
+        f'output = "{set_by_it}"  # then it is no input of [data]',
+        f'reference = "{reference}"  # an input of [data] instead',
+        f'measured = "{output}"',
+        "Kp = 1.0  # also Ki, Kd, filter: gains of a PID; or equations, or a transfer function",
+    ]
 
 
 def _data(

@@ -260,7 +260,7 @@ def outcome_of(plan: Plan, seed: int, draw: int, *, choices: bool) -> dict[str, 
     report = doubt(with_verdict(fit_variant(job, AS_DECLARED)))
     rows = [_declared_row(report)]
     if choices and report.fit.status.ok:
-        for kind, name, make in _choices(plan, job, report, planted, (seed, draw)):
+        for kind, name, make in _choices(plan, job, report.fit, planted, (seed, draw)):
             fit = _attempt(make)
             if fit is not None:
                 rows.append({"kind": kind, "name": name, "parameters": _values(plan.job, fit)})
@@ -325,11 +325,16 @@ def _values(job: Job, fit: Any) -> dict[str, Any]:
 Choice = tuple[str, str, Callable[[], Any]]
 
 
+def count_choices(plan: Plan) -> int:
+    """Return how many other choices there are beside the fit of the user's data."""
+    return sum(1 for _ in _choices(plan, plan.job, plan.fit, plan.terms[0][1], (0, 0)))
+
+
 def _choices(
-    plan: Plan, job: Job, report: FitReport, planted: Planted, key: tuple[int, int]
+    plan: Plan, job: Job, fit: Any, planted: Planted, key: tuple[int, int]
 ) -> Iterator[Choice]:
     """Yield kind and name of every other choice, and what fits it."""
-    fit, criterion, spec = report.fit, report.fit.criterion, job.spec
+    criterion, spec = fit.criterion, job.spec
     job = replace(job, spec=_changed(job, _ONE_START))
     yield "structure", PHYSICS_ONLY, lambda: job.run(Variant(PHYSICS_ONLY, criterion=criterion))
     for kind in job.physics.structures:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,10 +64,21 @@ class FitReport(Examination):
 
 
 @one_blas_thread()
-def fit_job(job: Job, progress: Progress = SILENT) -> FitReport:
-    """Train as the spec says, score every part, judge the learner, and try improvements."""
+def fit_job(
+    job: Job,
+    progress: Progress = SILENT,
+    finished: Callable[[FitReport], None] | None = None,
+) -> FitReport:
+    """Train as the spec says, score every part, judge the learner, and try improvements.
+
+    Args:
+        finished: called with the fit before improvements are tried, which may take long.
+    """
     release_programs()
-    return with_advice(doubt(with_verdict(fit_variant(job, AS_DECLARED, progress))))
+    fitted = doubt(with_verdict(fit_variant(job, AS_DECLARED, progress)))
+    if finished is not None:
+        finished(fitted)
+    return with_advice(fitted)
 
 
 def with_advice(fitted: FitReport) -> FitReport:

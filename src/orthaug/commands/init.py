@@ -275,7 +275,9 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
         with suppress(InputError):  # the last rows may lack samples, and then have no score
             test, _ = _record(found, roles, (cut, rows), missing)
             errors = free_run_errors(record, test, model)
-    text = spec_text(found, roles, out, rows, cut, gaps, named, model, motion)
+    text = spec_text(
+        found, roles, out, rows, cut, gaps, named, model, motion, [one.name for one in fed]
+    )
     return Draft(
         text,
         _account(

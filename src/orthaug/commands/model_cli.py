@@ -110,12 +110,16 @@ def predict(
 def split(
     model: ModelPath,
     data: Annotated[
-        list[Path], typer.Argument(metavar="DATA…", help="The files that the model was trained on.")
+        list[Path],
+        typer.Argument(metavar="DATA...", help="The files that the model was trained on."),
     ],
     measure: Annotated[
         str,
         typer.Option(
-            "--measure", metavar="KIND", help="As `kind` in the spec's [structure.measure]."
+            "--measure",
+            metavar="KIND",
+            help="training, symmetrized, uniform, samples or weighted; `kind` in the spec's "
+            "[structure.measure].",
         ),
     ] = "training",
     rows: Annotated[
@@ -177,7 +181,7 @@ def explain(
     model: ModelPath,
     data: Annotated[
         list[Path],
-        typer.Argument(metavar="DATA…", help="Data files, best those of the training."),
+        typer.Argument(metavar="DATA...", help="Data files, best those of the training."),
     ],
     degree: Annotated[
         int,
@@ -230,7 +234,9 @@ def export(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the code.")],
-    name: Annotated[str, typer.Option("--name", help="Name of files and functions.")] = "model",
+    name: Annotated[
+        str, typer.Option("--name", metavar="NAME", help="Name of files and functions.")
+    ] = "model",
     which: Which = "fitted",
     force: Force = False,
 ) -> None:

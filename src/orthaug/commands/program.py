@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
+import warnings
 from collections.abc import Sequence, Set
 from contextlib import suppress
 from pathlib import Path
@@ -59,7 +61,35 @@ class _Group(typer.core.TyperGroup):
             raise
 
 
-class ListOptionCommand(typer.core.TyperCommand):
+class PlainCommand(typer.core.TyperCommand):
+    """A command whose help names arguments as one types them: `DATA...`, `[SPEC]`, no types."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [_plain_usage(piece) for piece in super().collect_usage_pieces(ctx)]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        write = formatter.write_dl
+
+        def write_plain(rows: Sequence[tuple[str, str]], *args: Any, **options: Any) -> None:
+            write([(_TYPE.sub("", name), text) for name, text in rows], *args, **options)
+
+        formatter.write_dl = write_plain
+        super().format_options(ctx, formatter)
+        formatter.write_dl = write
+
+
+def _plain_usage(piece: str) -> str:
+    """Return an argument of a usage line without the marks that versions of typer add.
+
+    Examples:
+        >>> [_plain_usage(piece) for piece in ("{DATA...}...", "[[SPEC]]", "[NAME...]", "{MODEL}")]
+        ['DATA...', '[SPEC]', '[NAME...]', 'MODEL']
+    """
+    name = re.sub(r"[{}\[\]]|\.\.\.", "", piece) + "..." * ("..." in piece)
+    return f"[{name}]" if piece.startswith("[") else name
+
+
+class ListOptionCommand(PlainCommand):
     """A command whose repeatable options take several values too: `--inputs a b`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -128,8 +158,17 @@ GROUPS = {
     "Commands on the tool": ("schema", "reproduce", "benchmark"),
 }
 """The commands as `orthaug --help` lists them: in the order of work."""
+_TYPE = re.compile(r" <\S+>$")  # of an argument, which its own help says in words
 _SHORT = 100  # characters of the first line of a command's help: none is cut
-app = typer.Typer(
+
+
+class _App(typer.Typer):
+    def command(self, *args: Any, **options: Any) -> Any:
+        """Register a command, whose help is plain."""
+        return super().command(*args, **{"cls": PlainCommand} | options)
+
+
+app = _App(
     name="orthaug",
     cls=_Group,
     help="Fit physics together with a learned correction, so that physics keeps what it can "
@@ -215,6 +254,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of the 
 
 def main() -> None:
     """Run the command and turn errors into one line and an exit code."""
+    warnings.filterwarnings("ignore", "the rows of .* are taken to be 1 s apart")  # for Python
     try:
         code = app(prog_name="orthaug", standalone_mode=False)
         sys.stdout.flush()

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder, write_manifest
 from orthaug._base.lines import plural
 from orthaug._base.parallel import cores, one_blas_thread, one_core
-from orthaug.commands.draws import GROUPS, Asked, Plan, outcome_of, plan_for
+from orthaug.commands.draws import GROUPS, Asked, Plan, count_choices, outcome_of, plan_for
 from orthaug.commands.job import Job
 from orthaug.commands.opening import open_job
 from orthaug.reports.recovery import RecoverResult, recover_text
@@ -103,12 +103,14 @@ def rehearse(
     asked: Asked,
     folder: DrawFolder | None = None,
     progress: CasesProgress | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> Rehearsal:
     """Fit the job, simulate the draws, fit each, and compare with the truth.
 
     Args:
         folder: keeps each draw as it is made, and gives those that it has; None to keep none.
         progress: called with the draws done and all of them.
+        announce: called before the draws with the number of fits and the time they may take.
 
     Raises:
         InputError: a spec without a learner, rows that are not in memory, terms that cannot be
@@ -116,9 +118,16 @@ def rehearse(
         TrainingError: the fit of the user's data failed.
     """
     with one_blas_thread(), tempfile.TemporaryDirectory(prefix="orthaug-") as own:
+        began = time.monotonic()
         plan = plan_for(job, asked)
+        first = time.monotonic() - began
         place = Path(own) if folder is None else folder.begin(job)
-        found = _make_draws(plan, asked, place, progress)
+
+        def report_plan(lacking: Sequence[int], processes: int) -> None:
+            if announce is not None:
+                announce(_plan_text(plan, asked, lacking, processes, first))
+
+        found = _make_draws(plan, asked, place, progress, report_plan)
         done = runs(_study(plan, asked), store=place, workers=1)
     return Rehearsal(job, _result(plan, asked, done, found))
 
@@ -147,7 +156,13 @@ def _study(plan: Plan, asked: Asked, share: tuple[int, int] = (0, 1)) -> Study:
     return Study("draws", one_draw, cases, where=lambda draw, **_: draw % every == first)
 
 
-def _make_draws(plan: Plan, asked: Asked, store: Path, progress: CasesProgress | None) -> int:
+def _make_draws(
+    plan: Plan,
+    asked: Asked,
+    store: Path,
+    progress: CasesProgress | None,
+    report_plan: Callable[[Sequence[int], int], None],
+) -> int:
     """Make the draws that a store lacks, and return how many it had.
 
     They are made in this process and in others beside it.
@@ -157,8 +172,11 @@ def _make_draws(plan: Plan, asked: Asked, store: Path, progress: CasesProgress |
     """
     whole = _study(plan, asked)
     places = [store / whole.name / f"{whole.key(case)}.json" for case in whole.cases()]
-    missing = sum(not place.is_file() for place in places)
+    lacking = [draw for draw, place in enumerate(places) if not place.is_file()]
+    missing = len(lacking)
     every = max(1, min(cores(), missing // _FEWEST + 1))
+    if missing:
+        report_plan(lacking, every)
 
     def report(*_: Any) -> None:
         if progress is not None:
@@ -177,6 +195,21 @@ def _make_draws(plan: Plan, asked: Asked, store: Path, progress: CasesProgress |
                 other.stdin.close()  # ends it, as `watch_parent` says
             other.wait()
     return asked.draws - missing
+
+
+def _plan_text(
+    plan: Plan, asked: Asked, lacking: Sequence[int], processes: int, first: float
+) -> str:
+    """Return how many fits the `lacking` draws take, and roughly how long by the first fit."""
+    compared, choices = sum(draw < asked.compared for draw in lacking), count_choices(plan)
+    fits = len(lacking) + compared * choices
+    minutes = fits * first / processes / 60
+    length = "about a minute or less" if minutes < 1 else f"roughly {minutes:.0f} min"
+    also = f", {compared} of them with {plural(choices, 'other choice')}" if compared else ""
+    return (
+        f"rehearsal: {plural(fits, 'fit')} for {plural(len(lacking), 'draw')}{also}. They take "
+        f"{length}, since the fit of your data took {first:.2g} s."
+    )
 
 
 def _start(job: Job, asked: Asked, store: Path, share: tuple[int, int]) -> subprocess.Popen:

@@ -50,6 +50,8 @@ class SignalWatch:
         self._stop: Callable[[], Any] = _no_text
         self._then = ""
         self._asked: threading.Event | None = None
+        self.rescue: Callable[[], Any] = _no_text
+        """Writes what is finished already, before a signal ends the program."""
 
     def start(self) -> None:
         """Begin to wait for signals.
@@ -113,6 +115,8 @@ class SignalWatch:
         try:
             partials = getattr(sys.modules.get("orthaug._base.folders"), "PARTIALS", None)
             during = self._during()
+            with suppress(Exception):  # what cannot be written is lost, as without it
+                self.rescue()
             if partials is not None:
                 partials.discard_all()
             kept = ", ".join(str(path) for path in getattr(partials, "placed", ()) if path.exists())

@@ -7,6 +7,7 @@ there.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,10 @@ RowRange = tuple[int, int] | list[int]
 _RESOLUTION = 1e-6  # what rounding of the instants may change the mean step by, relative
 # Times the usual step: what the inputs did in a longer one is not known
 GAP = 10.0
+_NO_STEP = (
+    "the rows of {} are taken to be 1 s apart. Give `sampling_time` in seconds, or in `time` the "
+    "column that holds the instants; `sampling_time=1.0` keeps 1 s."
+)
 _LATEST = 1e11  # s; later than the year 5000
 # How files write a sample that is not there
 
@@ -63,7 +68,7 @@ def read_record(
         path: of a file that ends in .csv, .tsv, .txt, .dat, .parquet, .xlsx, .npz, .mat or .h5.
         inputs: channel names, or `Channel`s with column, unit, scale and offset.
         outputs: as `inputs`.
-        sampling_time: seconds between rows.
+        sampling_time: seconds between rows; without it and `time` 1 s, with a warning.
         time: the column that holds the instants, instead of `sampling_time`: numbers in the unit of
             its header (`t [ms]`; s without one), or dates, which count from the first row of the
             file.
@@ -99,6 +104,8 @@ def read_record(
     _check_time(time, sampling_time, {c.name: column_of[c.name] for c in channels[1]})
     check_choice(missing, ("error", "skip", "keep"), "`missing`")
     check_count(every, "every")
+    if sampling_time is None and time is None:
+        warnings.warn(_NO_STEP.format(show(path.name)), UserWarning, stacklevel=2)
     wanted: list[str] = list(
         dict.fromkeys([*column_of.values(), *(name for name in (time, experiment) if name)])
     )

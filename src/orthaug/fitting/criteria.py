@@ -75,7 +75,8 @@ _LOOKED_AT = 2**17  # samples of which the autocorrelation is taken
 class Prediction:
     """Declaration: the error of the prediction `horizon` steps ahead.
 
-    1 is the paper's criterion (eq:cost_fun).
+    With a horizon of 1 it is the paper's criterion, the mean square of Y − Ŷ (`eq:cost_fun` in
+    docs/notation.md).
 
     Examples:
         >>> Prediction(10).free_run

@@ -187,7 +187,7 @@ class Estimate(FitView):
 
     @property
     def one_step_theta(self) -> Vector | None:
-        """Φ⁺Y (nθ,), the one-step least squares, where θ was trained on another criterion.
+        """θ (nθ,) of physics alone by least squares one step ahead, where the fit has another.
 
         None otherwise, and of a motion.
         """
@@ -199,9 +199,10 @@ class Estimate(FitView):
         return noise_of(self.model, self.problem)
 
     def split(self, measure: Measure) -> Estimate:
-        """Return the same function with θ, components and intervals under a measure (F2).
+        """Return the same function with θ, components and intervals under a measure.
 
-        Nothing is trained again.
+        Nothing is trained again: θ is the least-squares fit of the physics to the function over
+        the measure's points.
 
         Raises:
             InputError: a measure that does not fit the model, or a θ that cannot be split.

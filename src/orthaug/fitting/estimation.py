@@ -112,11 +112,11 @@ def estimate(
 ) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
 
-    The criterion is the prediction error (eq:cost_fun), or the error of a free run.
+    The criterion is the mean square of the prediction error, or of the error of a free run.
 
-    θ is solved, never iterated (F1): with the orthogonal structure it is `Φ⁺Y` whatever the learner
-    does. Equations of motion (`Motion`) are fitted on their free run, and their parameters are the
-    physics nearest to the fitted motion.
+    θ is solved, never iterated: with the orthogonal structure it is the least-squares fit of
+    physics alone, whatever the learner does. Equations of motion (`Motion`) are fitted on their
+    free run, and their parameters are the physics nearest to the fitted motion.
 
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
@@ -129,8 +129,8 @@ def estimate(
             Structure, criterion and solver may be names as in a spec, such as "orthogonal",
             "simulation" and "adam-lbfgs", which stand for their defaults.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
-            free run: then θ is trained with the weights and split off at the end (F2). A motion
-            takes the latter, by default without washout.
+            free run: then θ is trained with the weights, and at the end the fitted function is
+            split. A motion takes the latter, by default without washout.
         solver: `LevenbergMarquardt(…)`, or `AdamLBFGS(…)`, the paper's pipeline from θ⁰.
         regularization: "none"; "evidence" (MacKay; the weights' prior is estimated too); "ard"
             (automatic relevance determination: the prior of each neuron, one step ahead); or a

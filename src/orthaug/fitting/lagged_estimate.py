@@ -80,7 +80,7 @@ class LaggedEstimate(Estimate):
 
     @property
     def one_step_theta(self) -> Vector | None:
-        """Φ⁺Y (nθ,), the one-step least squares, where θ was trained on another criterion.
+        """θ (nθ,) of physics alone by least squares one step ahead, where the fit has another.
 
         None otherwise.
         """
@@ -89,9 +89,10 @@ class LaggedEstimate(Estimate):
         return self.problem.least_squares
 
     def split(self, measure: Measure) -> LaggedEstimate:
-        """Return the same function with θ, components and intervals under a measure (F2).
+        """Return the same function with θ, components and intervals under a measure.
 
-        Nothing is trained again.
+        Nothing is trained again: θ is the least-squares fit of the physics to the function over
+        the measure's points.
 
         Raises:
             InputError: a measure that does not fit the model, or a θ at a bound.
@@ -145,7 +146,7 @@ class LaggedEstimate(Estimate):
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.
 
-        Convention "paper" for eq:cov_approx / N.
+        Convention "paper" for the paper's covariance (`eq:cov_approx`) divided by N.
         """
         if self.criterion.free_run is not None or (
             self.model.statistics.gram is None and self.model.numbers.tilt is None
@@ -330,7 +331,7 @@ class LaggedEstimate(Estimate):
             moved = ", ".join(
                 f"{name} {value:.6g}" for name, value in zip(baseline.names, one_step, strict=True)
             )
-            lines.append(f"one step    Φ⁺Y would give {moved}")
+            lines.append(f"one step    physics alone, fitted one step ahead, has {moved}")
         return lines
 
 

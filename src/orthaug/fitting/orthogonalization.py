@@ -22,7 +22,7 @@ from orthaug.physics.problem import pose
 def orthogonalize(
     record: Record, baseline: Baseline, function: Callable[[Any], Any], lags: Lags | None = None
 ) -> LaggedEstimate:
-    """Split a model trained elsewhere into physics and an orthogonal rest (F2).
+    """Split a model trained elsewhere into physics and an orthogonal rest.
 
     Args:
         record: the rows over which the rest is made orthogonal, usually the training data.
@@ -32,8 +32,9 @@ def orthogonalize(
         lags: the regressor that `function` expects; None for the raw lags of the baseline.
 
     Returns:
-        An estimate whose model predicts what `function` does, with `θ = Φ⁺G` and the learner `g −
-        φθ`. There are no standard errors: they belong to how `function` was trained.
+        An estimate whose model predicts what `function` does: θ is the least-squares fit of the
+        physics to it, and the learner what that leaves, `g − φθ`. There are no standard errors:
+        they belong to how `function` was trained.
     """
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)

@@ -95,15 +95,16 @@ class _SolvedTheta:
 
 @dataclass(frozen=True)
 class Orthogonal(_SolvedTheta):
-    """ŷ = φ(θ − θ_aux) + f with θ_aux = Φ_μ⁺F_μ (eq:orth_param).
+    """ŷ = φ(θ − θ_aux) + f: the learner f is kept orthogonal to the physics φ.
 
-    Under the training measure θ̂ = Φ⁺Y for every learner that sees all lags (F1). Under another
-    `measure` training is the same; at the end the fitted function is split over the measure's
-    points (F2).
+    θ_aux = Φ_μ⁺F_μ is the least-squares fit of the physics to the learner over the points of the
+    measure μ (`eq:orth_param` in docs/notation.md). Under the training measure θ is therefore the
+    least-squares fit of physics alone, for every learner that sees all lags. Under another
+    `measure` training is the same; at the end the fitted function is split over its points.
 
     A learner that sees less can imitate only some directions of θ. `shared` "auto" projects along
-    these alone, `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner
-    (F8). "all" is the paper.
+    these alone, `θ_aux = B(Φ_μB)⁺F_μ`; the others are what the fit determines beside the learner.
+    "all" projects along every direction, as the paper does.
 
     Examples:
         >>> from orthaug.inference.measures import Symmetrized

@@ -80,7 +80,10 @@ class WeightFiles:
     def resolve(self, place: MeasurePlace) -> Weighted:
         files = [place.folder / file for file in self.files]
         weights = np.concatenate(
-            [read_record(f, outputs=["weight"]).experiments[0].outputs[:, 0] for f in files]
+            [
+                read_record(f, outputs=["weight"], sampling_time=1.0).experiments[0].outputs[:, 0]
+                for f in files
+            ]
         )
         lengths = [len(experiment) for experiment in place.record.experiments]
         if len(weights) != sum(lengths):

@@ -16,6 +16,10 @@ from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.findings import NO_GUESS, SuspectResult
 from orthaug.analysis.fit_findings import ParameterResult
 
+REMOVED_BY = (
+    "Removed by: a measure, if some weighting of these points leaves none; the learner, if it sees "
+    "the term, from what it could not imitate."
+)
 _MOST_COLUMNS = 12  # more cells beside each other are too narrow for their numbers on paper
 _MOST_CELLS = 200
 _LEAST = 0.01  # per cent: a smaller bias is written as "less", since a cell is narrow

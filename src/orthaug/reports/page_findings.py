@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from orthaug.analysis.residual_tests import ResidualTestResult
+from orthaug.reports.biases import REMOVED_BY
 from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent, with_unit
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
 from orthaug.reports.result import FitResult
@@ -120,7 +121,8 @@ def stability_blocks(result: FitResult) -> list[Any]:
 def excitation_blocks(result: FitResult) -> list[Any]:
     """Return how well the data identify the parameters, and the bias by each suspected term."""
     seen = result.excitation
-    text = f"The data identify {seen.rank} of {seen.columns} parameters; "
+    alone = "Without a learner the" if result.learns else "The"
+    text = f"{alone} data determine {seen.rank} of {seen.columns} parameters; "
     text += f"the condition number is {number(seen.condition, 3)}."
     if result.orthogonality_defect is not None:
         small = result.orthogonality_defect < 1e-10
@@ -147,10 +149,7 @@ def excitation_blocks(result: FitResult) -> list[Any]:
         ]
         caption = "Terms that may be missing from the physics."
         if any(s.removed_by for s in result.bias):
-            caption = (
-                "Terms that may be missing from the physics, and what removes their bias from "
-                "the parameters."
-            )
+            caption += f" {REMOVED_BY}"
             head = [*head, "removed by"]
             rows = [[*row, s.removed_by or "–"] for row, s in zip(rows, result.bias, strict=True)]
         else:

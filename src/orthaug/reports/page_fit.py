@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.lines import BIASED_INTERVAL, digits_for
+from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.findings import MotionFitResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.fitting.estimates import STD_KINDS
@@ -157,7 +158,10 @@ def _parameters(result: FitResult) -> list[Any]:
     blocks += [plot] if plot else []
     blocks += _over_experiments(result)
     blocks += _noise_model(result)
-    causes = [f"{percent(share)} is {cause}" for cause, share in biased_by(rows)]
+    causes = [
+        f"{percent(share)} {'looks like' if result.learns and share < SURE_SHARE else 'is'} {cause}"
+        for cause, share in biased_by(rows)
+    ]
     if causes:
         text, more = (
             f"{' in one equation' if len(causes) > 1 else ''} {', in another '.join(causes)}",

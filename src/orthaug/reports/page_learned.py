@@ -21,7 +21,7 @@ from orthaug.reports.page_blocks import (
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud
 _COLOURED = 0.98  # of the cells of a surface have a colour of their own
-_LEVEL = 0.02  # share of the learned part below which an input is said to explain next to nothing
+_LEVEL = 0.02  # share of the learned part below which an input is said to explain little
 
 
 def learned_blocks(part: LearnedPart, measure: str) -> list[Text | Grid | Plot]:
@@ -60,7 +60,10 @@ def _introduction(part: LearnedPart, ranked: list[str], shares: Any, measure: st
     idle = [name for name in ranked[1:] if explained[part.features.index(name)] < _LEVEL]
     if idle:
         itself, explains = ("itself", "explains") if len(idle) == 1 else ("themselves", "explain")
-        text += f" By {itself} {', '.join(idle)} {explains} next to nothing of it."
+        text += (
+            f" By {itself} {', '.join(idle)} {explains} less than {percent(_LEVEL)} of it; with "
+            "other inputs it may be more."
+        )
     return text
 
 
@@ -201,8 +204,8 @@ def _surface_plot(part: LearnedPart, k: int, across: str, along: str) -> Plot:
         else "the mean of the training data in each cell"
     )
     caption = (
-        f"What the learner adds to {part.names[k]} over {across} and {along}, two inputs that "
-        f"explain much of it, {how}. It is drawn where training data are near; the dots are these "
+        f"What the learner adds to {part.names[k]} over {across} and {along}, the inputs with "
+        f"the largest shares, {how}. It is drawn where training data are near; the dots are these "
         "data."
     )
     layout = axis_titles(with_unit(across, units[across]), with_unit(along, units[along]))

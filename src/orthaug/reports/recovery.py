@@ -17,6 +17,18 @@ DECLARED = "declared"
 _CLEARLY = 0.7  # of the error as declared: a choice that errs less is named
 _WIDTH = 80  # columns of the text
 _SHOWN = 12  # choices and terms in the text; recover.json has all
+_EXPLAINED = (
+    "held: 95 % intervals for noise that hold the true value, of those that were shown; with "
+    "bias: the same of the widest interval that is shown.",
+    "silent: estimates whose intervals miss the true value though nothing warns.",
+    "bias: mean error of the estimates; of std, bias/std: the same in standard errors. Of a term "
+    "it is that of the parameter that errs most.",
+    "width: median width of the interval for noise; 2 N: its width with twice the rows.",
+)
+_EXPLAINED_CHOICES = (
+    "error of θ: median over the draws of the root mean square of the parameters' relative "
+    "errors; over spec: the same divided by that of the spec. held: as above."
+)
 _HALF_WIDTH = 1.0  # half widths: a bias beyond that no further row cures
 
 
@@ -426,9 +438,11 @@ def recover_text(result: RecoverResult) -> str:
         *_parameter_table(result),
         "",
         *_term_table(result),
+        "",
+        *_EXPLAINED,
     ]
     if result.choices:
-        lines += ["", *_choice_table(result)]
+        lines += ["", *_choice_table(result), "", _EXPLAINED_CHOICES]
     lines += ["", *result.text]
     lines += [f"left out: {one.name}: {one.reason}." for one in result.left_out]
     lines += [f"warning: {warning.text}" for warning in result.warnings]

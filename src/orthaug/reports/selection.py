@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.content import Content, Flag, Number, Whole
 from orthaug._base.errors import Warning
-from orthaug._base.lines import estimate_cells, fold, table
+from orthaug._base.lines import estimate_cells, fold, plural, table
 from orthaug.inference.chosen_terms import Intervals
 from orthaug.reports.result import DataResult, ResultHeader
 from orthaug.selection.orders import Delay, Orders
 
+if TYPE_CHECKING:
+    from orthaug.data.record import Channel
+
 _SHOWN = 12  # models of a stage in the text
+_CHOOSE_LAGS = ', which kind = "terms" in [learner] chooses from'
 _EXPLAINED = (
     "chosen: share of random halves of the data that choose the term. left: share of its norm "
     "that physics and other terms do not explain. rate: lowest rate of false discoveries at "
@@ -94,8 +98,12 @@ class SelectResult(ResultHeader):
     warnings: list[Warning]
 
 
-def selection_text(result: SelectResult) -> str:
-    """Return a page of text: what was chosen, why, and the models beside it."""
+def selection_text(result: SelectResult, output: Channel) -> str:
+    """Return a page of text: what was chosen, why, and the models beside it.
+
+    Args:
+        output: the one that is simulated; the errors have its unit.
+    """
     from orthaug.selection.orders import Delay, Orders
 
     orders = Orders(result.orders.na, tuple(result.orders.nb), tuple(result.orders.nk))
@@ -105,7 +113,7 @@ def selection_text(result: SelectResult) -> str:
         for delay in result.delays
     ]
     if result.nonlinearity is not None:
-        lines.append(f"nonlinear    {result.nonlinearity.text}")
+        lines.append(f"nonlinear    {result.nonlinearity.text}{_chosen_anyway(result, output)}")
     lines.append(f"learner      {_learner(result)}")
     lines.append(f"intervals    {result.intervals.source}: {result.intervals.text}")
     if result.terms:
@@ -118,9 +126,48 @@ def selection_text(result: SelectResult) -> str:
         lines += _physics(result)
     for stage in dict.fromkeys(row.stage for row in result.models):
         lines += ["", *_table(stage, [row for row in result.models if row.stage == stage])]
+    if result.models:
+        lines += ["", _explain_error(output)]
     for warning in result.warnings:
         lines += ["", f"note: {warning.text}"]
     return "\n".join(fold(lines))
+
+
+def _explain_error(output: Channel) -> str:
+    """Return what the error of the tables is, in which unit and over what rows."""
+    unit = output.unit or f"the unit of {output.name}"
+    return (
+        f"error: root mean square error of {output.name} in free runs, in {unit}, on blocks of the "
+        "training rows that the model was not fitted to. The arrow marks the smallest model whose "
+        "error is as good as the lowest, within its standard error or 2 %."
+    )
+
+
+def _chosen_anyway(result: SelectResult, output: Channel) -> str:
+    """Return why a nonlinear learner is chosen where the test found nothing; else empty."""
+    from orthaug.selection.nonlinearity import Nonlinearity
+
+    test, learner = result.nonlinearity, result.learner
+    if test is None or test.p is None or learner is None:
+        return ""
+    bent = [one for one in learner.get("terms", ["network"]) if one not in test.regressors]
+    rows = [row for row in result.models if row.stage in ("learner", "terms")]
+    alone = next((row for row in rows if not row.size), None)
+    chosen = next((row for row in rows if row.chosen), None)
+    lags = next((row for row in result.models if row.stage == "orders" and row.chosen), None)
+    if not bent or alone is None or chosen is None or Nonlinearity(test.p, {}).found:
+        return ""
+    before, after = (_error_of(row, output) for row in (alone, chosen))
+    what, also = ("Terms are", "") if "terms" in learner else ("A network is", _CHOOSE_LAGS)
+    linear = "" if lags is None else f" Linear lags alone reach {_error_of(lags, output)}{also}."
+    return (
+        f" {what} chosen all the same: in free runs over held-out blocks the error falls from "
+        f"{before} to {after}.{linear}"
+    )
+
+
+def _error_of(row: SelectionRowResult, output: Channel) -> str:
+    return "no bound" if row.score is None else f"{row.score:.3g} {output.unit}".rstrip()
 
 
 def _p_text(p: float | None) -> str:
@@ -162,9 +209,9 @@ def _learner(result: SelectResult) -> str:
     if learner is None:
         return "none: nothing beside the physics lowers the error on the held-out blocks"
     if learner["kind"] == "terms":
-        return f"{len(learner['terms'])} terms"
+        return plural(len(learner["terms"]), "term")
     seen = ", ".join(learner.get("inputs") or ["all lags"])
-    return f"{learner['hidden'][0]} neurons of {seen}"
+    return f"{plural(learner['hidden'][0], 'neuron')} of {seen}"
 
 
 def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:

@@ -23,7 +23,8 @@ from orthaug._base.lines import (
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.findings import SharedResult, SuspectResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
-from orthaug.reports.biases import biased_by
+from orthaug.reports.biases import REMOVED_BY, biased_by
+from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
 from orthaug.reports.result import (
     CheckResult,
     CompareResult,
@@ -47,7 +48,10 @@ ADVISED = 2  # changes that a text advises at most; result.json has all
 
 
 def fit_text(fit: Estimate, result: Findings) -> str:
-    """Return parameters, scores on every part, residual tests, the verdict and warnings."""
+    """Return parameters, scores on every part, residual tests and warnings.
+
+    Of a spec's fit the changes that were tried follow, and the verdict that its page begins with.
+    """
     if not fit.status.ok:
         return ""
     between = NOISE_ONLY if result.noise_only else INTERVAL_HEAD
@@ -70,8 +74,14 @@ def fit_text(fit: Estimate, result: Findings) -> str:
         parts,
         warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
     ]
-    blocks.append(_advice_lines(result) if isinstance(result, FitResult) else [])
+    if isinstance(result, FitResult):
+        blocks += [_advice_lines(result), [verdict_line(fit_verdict(result))]]
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
+
+
+def verdict_line(verdict: PageVerdict) -> str:
+    """Return the verdict with which a page begins: is the model reliable, and for what use."""
+    return f"Verdict: {verdict.trust} {verdict.use}"
 
 
 def _withdraw_claim(line: str, result: Findings) -> str:
@@ -126,9 +136,7 @@ def check_text(result: CheckResult) -> str:
         lines += [
             "",
             "Bias of each parameter if a term is missing from the physics. Size: its share of "
-            "the output's deviation, 1 % where no coefficient is given. Removed by: a measure, "
-            "if some weighting of these points leaves none; the learner, if it sees the term, "
-            "from what it could not imitate.",
+            f"the output's deviation, 1 % where no coefficient is given. {REMOVED_BY}",
             *_suspect_lines(result.bias),
         ]
     return "\n".join(fold([*lines, *warning_lines(result.warnings)]))
@@ -154,8 +162,8 @@ def _shared_lines(shared: SharedResult) -> list[str]:
 def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     """Return two tables, parameters with standard errors and scores on every part.
 
-    The verdicts on each row follow. Of saved results the parameters have intervals and differences,
-    and the settings that differ are a third table.
+    The verdicts on each row follow, and at the end which one to take. Of saved results the
+    parameters have intervals and differences, and the settings that differ are a third table.
     """
     saved = result.differences is not None
     what = "result" if saved else "structure"
@@ -184,7 +192,8 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
         lines += [
             f"warning: {row.name}: {w.text}" for w in row.warnings if w not in result.warnings
         ]
-    return "\n".join(fold(lines)).rstrip()
+    lines += ["", verdict_line(compare_verdict(result))]
+    return "\n".join(fold(lines))
 
 
 def _difference_lines(result: CompareResult) -> list[str]:

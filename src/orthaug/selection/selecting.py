@@ -13,6 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import check_count, check_number, check_type
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import plural
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags, in_order
@@ -89,7 +90,7 @@ def search_learners(
         words = (
             ()
             if one is None
-            else (f"{one.hidden[0]} neurons of {', '.join(one.inputs or ('all lags',))}",)
+            else (f"{plural(one.hidden[0], 'neuron')} of {', '.join(one.inputs or ('all lags',))}",)
         )
         rungs.append(
             PathModel(

@@ -388,7 +388,7 @@ def _findings(checked: Mapping[str, Any], bias: Sequence[Mapping[str, Any]]) -> 
         )
         text(hint, "p", "hint")
         rows = [(one["name"], _biases(one["percent"]), one["removed_by"] or "–") for one in bias]
-        table(("missing term", "change of each parameter", "removed by"), rows)
+        table(("suspect", "bias of each parameter", "removed by"), rows)
     for warning in checked["warnings"]:
         note(warning["text"], "care")
 
