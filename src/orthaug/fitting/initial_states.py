@@ -19,6 +19,7 @@ from orthaug._base.jax import AnyArray, ArrayModule
 from orthaug.fitting.segments import Sensitivity
 
 _UNSEEN = 1e-12  # of the largest curvature: a combination of states that no output shows
+_LED = 0.1  # of what the best states are off: a step that moves them less follows, they lead
 
 
 class Start(NamedTuple):
@@ -39,15 +40,25 @@ class Start(NamedTuple):
         """True where the derivative of the best states by (c, w) is known."""
         return self.slope is not None or self.there is not None
 
-    def at(self, unknowns: Vector) -> Float[np.ndarray, "k n0 m"] | None:
+    def at(self, unknowns: Vector, share: float = 1.0) -> Float[np.ndarray, "k n0 m"] | None:
         """Return the best states to first order where (c, w) is `unknowns`.
 
         None where that is not known.
+
+        Args:
+            share: of the way to them.
         """
         if self.offset is None or self.slope is None or self.unknowns is None:
             return None
         moved = self.offset - self.slope @ (unknowns - self.unknowns)
-        return self.values + np.moveaxis(moved, 1, -1)
+        return self.values + share * np.moveaxis(moved, 1, -1)
+
+    def is_led_by_states(self, unknowns: Vector) -> bool:
+        """Return whether a step of (c, w) moves the best states by less than they are off."""
+        if self.offset is None or self.slope is None or self.unknowns is None:
+            return False
+        followed = np.linalg.norm(self.slope @ (unknowns - self.unknowns), axis=-1)
+        return bool(np.all(followed <= _LED * np.linalg.norm(self.offset, axis=-1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,13 @@ from orthaug.fitting.segments import Segments, packed, respond, sensitivity
 from orthaug.models.dynamics import Dynamics, Numbers
 
 RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
+_SHARES = (
+    0.25,
+    0.06,
+    0.015,
+    0.004,
+    0.001,
+)  # of the way to the best states, where that leads too far
 _LARGEST_ERROR = 1e120
 
 
@@ -89,7 +96,8 @@ class FreeRunObjective:
     def evaluate(self, p: Vector, start: Start) -> TrialPoint:
         """Return a trial at p.
 
-        The states follow p to first order. Where that does not lower the misfit, they stay.
+        The states follow p to first order. Where that does not lower the misfit, they stay. Where
+        the step hardly moves them, and what they lack leads too far, they go a part of the way.
         """
         theta, c, w = self.place(p)
         trials: list[TrialPoint] = []
@@ -99,12 +107,34 @@ class FreeRunObjective:
             trials.append(TrialPoint(p, theta, c, w, states, errors, misfit, misfit, squares))
             if total < start.misfit:
                 break
+        else:
+            trials += self._part_of_the_way(p, start)
         best = min(trials, key=lambda trial: trial.misfit)
         if self.sums is not None and best is trials[0] and self.initial.free and start.follows:
             return best._replace(
                 states=self.sums.moved(start, np.concatenate([c, w]) - start.unknowns)
             )
         return best
+
+    def _part_of_the_way(self, p: Vector, start: Start) -> list[TrialPoint]:
+        """Return the first trial at p that lowers the misfit with states a part of the way."""
+        theta, c, w = self.place(p)
+        unknowns = np.concatenate([c, w])
+        if self.sums is not None or not self.initial.free or not start.is_led_by_states(unknowns):
+            return []
+        for share in _SHARES:
+            states: Any = start.at(unknowns, share)
+            total, errors = self._misfit(c, w, states)
+            if total < min(start.misfit, self._largest):
+                return [TrialPoint(p, theta, c, w, states, errors, total, total)]
+        return []
+
+    def _misfit(self, c: Vector, w: Vector, states: Any) -> tuple[float, Any]:
+        """Return `‖r‖²` from states, and the errors."""
+        errors = self.errors(c, w, states, self.segments)
+        with np.errstate(all="ignore"):
+            total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
+            return total + self.initial.loss(states, self.start_rows), errors
 
     def _try(
         self, c: Vector, w: Vector, start: Start, follows: bool
@@ -124,10 +154,7 @@ class FreeRunObjective:
             )
             return total, start.values, None, squares
         states: Any = start.at(unknowns) if follows else start.values
-        errors = self.errors(c, w, states, self.segments)
-        with np.errstate(all="ignore"):
-            total = float(np.sum(np.einsum("oi,ktim->ktom", self.weight, errors) ** 2))
-            total += self.initial.loss(states, self.start_rows)
+        total, errors = self._misfit(c, w, states)
         return total, states, errors, None
 
     def linearise(self, point: TrialPoint) -> LinearisedFreeRun:
