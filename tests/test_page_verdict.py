@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 from orthaug._base.errors import Warning
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import (
@@ -189,3 +191,11 @@ def test_the_terminal_ends_with_the_verdict_that_the_page_begins_with():
     last = compare_text(result.model_copy(update={"differences": None}), {}).split("\n\n")[-1]
     assert " ".join(last.split()) == f"Verdict: {verdict.trust} {verdict.use}"
     assert verdict.trust.startswith("Take “orthogonal”: the RMS error of its free run")
+
+
+@pytest.mark.parametrize("code", ["short_for_noise", "parameter_drift", "local_minimum"])
+def test_a_warning_that_intervals_leave_something_out_is_in_the_verdict(code):
+    found = fit_verdict(fitted(warnings=[Warning(code, "")]))
+    assert found.level == "care"
+    assert "Do not read a as physics yet" in found.use
+    assert "read a as physics" in fit_verdict(fitted()).use

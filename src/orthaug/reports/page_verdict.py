@@ -343,6 +343,14 @@ _UNTESTED = {
     "little_left": "a parameter rests on little of its regressor beside the learner",
     "output_without_learner": "an output has parameters of a learned equation, but no learner",
     "few_frequencies": "its input has too few frequencies to test the physics",
+    "local_minimum": "training from other initial values explains its data better",
+    "several_solutions": "other values of its parameters explain its data as well",
+    "parameter_drift": "a parameter changes over its record",
+    "differs_between_experiments": "its parameters differ between the experiments",
+    "held_output": "a sensor is slower than the rows of its data",
+    "saturated_output": "an output is recorded at an end of its range",
+    "wild_rows": "a few rows, which may be wrong, decide its parameters",
+    "short_for_noise": "its record is too short to distinguish noise from disturbances that last",
 }
 """Doubts by warnings that no test of the residual sees."""
 
