@@ -18,6 +18,7 @@ from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
+from orthaug.physics.problem import Problem
 
 if TYPE_CHECKING:
     from orthaug.analysis.family_tests import FamilyTest
@@ -78,7 +79,7 @@ def doubt(made: E) -> E:
     unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
     if test is not None and test.is_far and fit.model.coloured and not unmodelled:
         test = None  # disturbances add up along a free run, which innovations do not show
-    left = _static_share(result) if unmodelled else 0.0
+    left = _static_share(result) if unmodelled and not _is_slow(fit, test) else 0.0
     known = {warning.code for warning in result.warnings}
     warnings: list[Warning] = list(failed)
     if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
@@ -110,6 +111,16 @@ def doubt(made: E) -> E:
     if result.shared is not None and reason:
         found["shared"] = _withdraw(result.shared, reason)
     return replace(made, result=result.changed(**found))
+
+
+def _is_slow(fit: Any, test: StructureTest | None) -> bool:
+    """Return whether functions follow a free run's errors only because both are slow.
+
+    Of lagged physics: filtered until noise in them is white, the errors show no such function.
+    """
+    if not fit.criterion.simulates or not isinstance(fit.problem, Problem):
+        return False
+    return test is not None and test.static is None
 
 
 def _static_share(result: Findings) -> float:
@@ -178,7 +189,7 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
         what = f"the model's error contains more than noise: {_functions_text(left)}"
     elif test is None or not test.found:
         what = _more_than_noise(result)
-        if _is_disturbance(fit, result):
+        if _is_disturbance(fit, result, slow=_is_slow(fit, test)):
             kind = "innovations" if result.motion is not None else "auto"
             return (
                 f"{what}, and neither the inputs nor functions of the regressors predict it: a "
@@ -267,13 +278,20 @@ def _has_intervals(result: Findings) -> bool:
     return any(row.ci95 is not None for row in rows)
 
 
-def _is_disturbance(fit: Any, result: Findings) -> bool:
-    """Return whether the residual follows from its own past alone, without a noise model of it."""
+def _is_disturbance(fit: Any, result: Findings, *, slow: bool = False) -> bool:
+    """Return whether the residual follows from its own past alone, without a noise model of it.
+
+    Args:
+        slow: whether functions follow it only because both are slow.
+    """
     shares = (result.residuals.predictable if result.residuals else None) or ()
     return (
         not fit.model.coloured
         and any(one.own_past > _OWN_PAST for one in shares)
-        and all(max(one.inputs, one.functions) < _UNRELATED * one.own_past for one in shares)
+        and all(
+            max(one.inputs, 0.0 if slow else one.functions) < _UNRELATED * one.own_past
+            for one in shares
+        )
     )
 
 
