@@ -303,6 +303,11 @@ _TAMED = 0.1  # of the error of a run that runs away, above which one still runs
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
+_HALVED = 0.5  # of the error: a gain that slow errors do not give
+_CHANCE = (
+    " It may be chance: the errors remember each other over much of the record, so that few are "
+    "independent."
+)
 _LISTED = 3  # changes without gain that the text names
 
 
@@ -471,12 +476,26 @@ def advise(
         return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
     chosen = found[: job.physics.most_trials]
     tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
-    return _conclude_trials(base, tried, rows, len(found) - len(tried), learns)
+    slow = result.standard_errors_by == "autoregressive" or any(
+        warning.code == "too_long_memory" for warning in result.warnings
+    )
+    return _conclude_trials(base, tried, rows, len(found) - len(tried), learns, slow=slow)
 
 
 def _conclude_trials(
-    base: Pieces, tried: Sequence[ProposalErrors], rows: ValidationRows, left: int, learns: bool
+    base: Pieces,
+    tried: Sequence[ProposalErrors],
+    rows: ValidationRows,
+    left: int,
+    learns: bool,
+    *,
+    slow: bool,
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
+    """Return the changes that help, and a text on all that were tried.
+
+    Args:
+        slow: whether errors remember each other for so long that few of them are independent.
+    """
     before = math.sqrt(mean_square(base))
     poor = before < _RUNS_AWAY  # then what stays no better than the mean is no remedy
     helps = [
@@ -493,7 +512,8 @@ def _conclude_trials(
     advice = [
         AdviceResult(
             change=one.proposal.change,
-            text=_advice_text(one, before, rows),
+            text=_advice_text(one, before, rows)
+            + (_CHANCE if slow and one is better[0] and _may_be_chance(one, before) else ""),
             before=before,
             after=one.error,
         )
@@ -539,6 +559,11 @@ def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
         for a, b in zip(pieces, base, strict=True)
     ]
     return Ratio.of([a for a, _ in cut], [b for _, b in cut])
+
+
+def _may_be_chance(one: ProposalErrors, before: float) -> bool:
+    """Return whether a gain is so small that slow errors may give it."""
+    return one.proposal.ahead is None and one.error > _HALVED * before
 
 
 def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
