@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -24,6 +24,8 @@ from orthaug import (
 from orthaug.analysis.robustness import robust_where_asked
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.colour import correlation_length
+
+estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
 
 THETA = np.array([1.5, -0.7, 0.3, 0.2])
 PHYSICS = Baseline.from_terms(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,8 @@ import scipy.stats
 
 from orthaug import MLP, Baseline, LevenbergMarquardt, Record, Term, estimate, synthetic
 from orthaug.inference.covariance import interval, noise_covariance
+
+estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
 
 ROWS = 60
 U = np.random.default_rng(0).normal(size=(ROWS, 3)) * [1.0, 1e-3, 50.0]

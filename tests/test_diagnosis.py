@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from functools import cache
+from functools import cache, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,6 +31,8 @@ from orthaug.analysis.findings import DiagnosisResult
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.verdict_text import _shares
 from orthaug.fitting.inconsistency import inconsistency
+
+estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
 
 PHYSICS = Baseline.from_terms([Term("a", "y[k-1]"), Term("b", "y[k-2]"), Term("g", "u[k-1]")])
 EVIDENCE = {

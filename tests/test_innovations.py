@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from scipy.optimize import least_squares
 from test_cli import run
 
 import orthaug as oa
+
+estimate = partial(oa.estimate, standard_errors="plain")  # robust ones are asked for here
 
 TS, TRUE = 0.1, np.array([1.2, 4.0])  # damping and stiffness of a mass of 1 kg
 
@@ -67,7 +70,7 @@ def fitted(own: oa.Record, **options: Any) -> Any:
         "noise": "innovations",
         "solver": EXACT,
     }
-    return oa.estimate(own, motion(), **given | options)
+    return estimate(own, motion(), **given | options)
 
 
 def matrices(c: float, k: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -182,7 +185,7 @@ LEARNER = oa.MLP(hidden=(4,), inputs=("v",))
 @pytest.fixture(scope="module")
 def learned() -> Any:
     own = record_of(simulate(0, rows=800, friction=1.0))
-    return oa.estimate(
+    return estimate(
         own, motion(learned=True), learner=LEARNER, noise=oa.Innovations(), regularization=1e-3,
         fallback=False, blocks=0,
     )  # fmt: skip
@@ -259,7 +262,7 @@ def fit_room(own: oa.Record, noise: str) -> Any:
         ["u"],
         integrator="discrete",
     )
-    return oa.estimate(own, heated, learner=None, noise=noise)
+    return estimate(own, heated, learner=None, noise=noise)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -296,7 +299,7 @@ def test_held_inputs_and_integrators_have_it() -> None:
         integrator="exact",
         hold="first-order",
     )  # fmt: skip
-    fit = oa.estimate(own, physics, learner=None, noise="innovations")
+    fit = estimate(own, physics, learner=None, noise="innovations")
     assert fit.status.ok and fit.noise[0].model == "innovations"
     assert np.all(np.abs(fit.values / TRUE - 1) < 0.6)
 
@@ -320,9 +323,7 @@ def test_functions_have_it(alone: Any) -> None:
         integrator="discrete",
     )
     own = record_of(simulate(0))
-    fit = oa.estimate(
-        own, physics, learner=None, noise="innovations", criterion=WHOLE, solver=EXACT
-    )
+    fit = estimate(own, physics, learner=None, noise="innovations", criterion=WHOLE, solver=EXACT)
     np.testing.assert_allclose(fit.values, alone.values, rtol=1e-7)
 
 
@@ -348,9 +349,9 @@ def test_a_learner_with_states_and_a_warm_start_are_refused(learned: Any) -> Non
     own = learned.problem.record
     with pytest.raises(oa.InputError, match="states of its own"):
         memory = oa.MLP(hidden=(4,), inputs=("v",), states=1)
-        oa.estimate(own, motion(learned=True), learner=memory, noise="innovations")
+        estimate(own, motion(learned=True), learner=memory, noise="innovations")
     with pytest.raises(oa.InputError, match="leave out `initial`"):
-        oa.estimate(own, motion(learned=True), initial=learned, noise="innovations")
+        estimate(own, motion(learned=True), initial=learned, noise="innovations")
 
 
 SPEC = """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import control
@@ -21,6 +22,8 @@ from orthaug.analysis.measured_response import measured_response
 from orthaug.data.expressions import Lag
 from orthaug.models.stepping import Memory
 from orthaug.reports.linear_text import linear_text
+
+estimate = partial(oa.estimate, standard_errors="plain")  # robust ones are asked for here
 
 STEP = 0.05
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
@@ -58,7 +61,7 @@ def linear() -> oa.Estimate:
         for out, regressors in rows
         for i, r in enumerate(regressors)
     ]
-    return oa.estimate(two_by_two(), oa.Baseline.from_terms(terms), learner=None)
+    return estimate(two_by_two(), oa.Baseline.from_terms(terms), learner=None)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +73,7 @@ def cubic() -> oa.Estimate:
         y[k] = 1.2 * y[k - 1] - 0.2 * y[k - 1] ** 3 + 0.3 * u[k - 1] + 0.02 * rng.normal()
     baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
     record = oa.Record.from_arrays(u, y, sampling_time=STEP, inputs=["u"], outputs=["y"])
-    return oa.estimate(record, baseline, learner=oa.Terms(["y[k-1]**3"]))
+    return estimate(record, baseline, learner=oa.Terms(["y[k-1]**3"]))
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +107,7 @@ def pendulum() -> oa.MotionEstimate:
         inputs=["torque"],
         outputs=["q"],
     )
-    return oa.estimate(record, motion, learner=None)
+    return estimate(record, motion, learner=None)
 
 
 PENDULUM = "(torque - d*rate - g*sin(angle))/J"
@@ -343,7 +346,7 @@ def test_what_has_no_linear_view_is_said(linear, cubic):
     record = oa.Record.from_arrays(steps, position, inputs=["u"], outputs=["y"])
     terms = [oa.Term("b", "u[k]")]
     integrator = oa.Baseline.from_terms([oa.Term("one", "y[k-1]", fixed=True, initial=1.0), *terms])
-    model = oa.estimate(record, integrator, learner=None).model
+    model = estimate(record, integrator, learner=None).model
     view = oa.linearize(model)
     assert view[0].gain is None and view.warnings[0].code == "continuum_of_equilibria"
     assert "a pole at 1 integrates" in linear_text(view)
@@ -387,7 +390,7 @@ def test_dry_friction_at_rest_is_no_line():
     baseline = oa.Baseline.from_terms(
         [oa.Term(n, r) for n, r in (("a", "y[k-1]"), ("f", "sign(y[k-1])"), ("b", "u[k-1]"))]
     )
-    model = oa.estimate(oa.Record.from_arrays(u, y), baseline, learner=None).model
+    model = estimate(oa.Record.from_arrays(u, y), baseline, learner=None).model
     assert [warning.code for warning in oa.linearize(model, "u = 0, y = 0")[0].warnings] == ["kink"]
     assert not oa.linearize(model, "y = 2")[0].warnings
 
@@ -509,5 +512,5 @@ def test_a_static_gain_that_is_rounding_is_zero():
     )
     noisy = np.array(y) * (1 + 1e-2 * rng.normal(size=(1200, 2)))
     record = oa.Record.from_arrays(u, noisy, sampling_time=2e-5, outputs=["uc", "il"])
-    gain = oa.linearize(oa.estimate(record, motion, learner=None).model)[0].gain
+    gain = oa.linearize(estimate(record, motion, learner=None).model)[0].gain
     assert gain[0, 0] == pytest.approx(1, abs=1e-9) and gain[1, 0] == 0

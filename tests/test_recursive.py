@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from test_surface import tried
 import orthaug as oa
 from orthaug.data.regressors import stack_rows
 from orthaug.fitting.recursive_rows import whitened_rows
+
+estimate = partial(oa.estimate, standard_errors="plain")  # robust ones are asked for here
 
 ROOT = Path(__file__).resolve().parents[1]
 TERMS = [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]
@@ -40,9 +43,7 @@ def two_outputs(seed: int) -> oa.Record:
 
 def fitted(record: oa.Record | None = None, **options) -> oa.Estimate:
     given = {"learner": oa.MLP((4,)), **QUICK, **options}
-    return oa.estimate(
-        system(0) if record is None else record, oa.Baseline.from_terms(TERMS), **given
-    )
+    return estimate(system(0) if record is None else record, oa.Baseline.from_terms(TERMS), **given)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def fit() -> oa.Estimate:
 def shared_gain() -> oa.Estimate:
     terms = [oa.Term("a", "y1[k-1]", output="y1"), oa.Term("a", "y2[k-1]", output="y2")]
     terms += [oa.Term("g", "u1[k-1]", output="y1"), oa.Term("h", "u2[k-1]", output="y2")]
-    return oa.estimate(two_outputs(0), oa.Baseline.from_terms(terms), learner=oa.MLP((4,)), **QUICK)
+    return estimate(two_outputs(0), oa.Baseline.from_terms(terms), learner=oa.MLP((4,)), **QUICK)
 
 
 FITS = {
@@ -212,7 +213,7 @@ def test_intervals_count_the_colour_of_the_errors():
     for k in range(1, 2000):
         e[k] += 0.9 * e[k - 1]
     record = oa.Record.from_arrays(u, 2 * u + e)
-    fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
+    fit = estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
     robust = fit.robust(60)
     for online in (oa.Recursive(fit), oa.Recursive(fit.model, training=record)):
         assert online.std is not None and online.std[0] > 1.8 * fit.std[0]
@@ -241,7 +242,7 @@ def test_what_cannot_be_followed_is_refused(fit):
         oa.InputError, match="the fit minimises the free run's error, but recursive least squares"
     ):
         oa.Recursive(flown)
-    bounded = oa.estimate(
+    bounded = estimate(
         system(0),
         oa.Baseline.from_terms([*TERMS[:2], oa.Term("g", "u[k-1]", max=0.5)]),
         learner=None,

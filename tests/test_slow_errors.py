@@ -1,6 +1,7 @@
 """Slow errors of a free run look like functions of what is slow: that is no missing physics."""
 
 import numpy as np
+import pytest
 
 import orthaug as oa
 
@@ -18,7 +19,27 @@ def kiln(rows=2000, seed=3):
 
 def test_a_slow_disturbance_is_described_by_noise_and_not_by_a_learner():
     terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]"), oa.Term("q", "(y[k-1]/3)**2")]
-    fit = oa.estimate(kiln(), oa.Baseline.from_terms(terms), learner=None, criterion=oa.Simulation())
+    fit = oa.estimate(
+        kiln(), oa.Baseline.from_terms(terms), learner=None, criterion=oa.Simulation()
+    )
     found = fit.diagnose()
     texts = [one.text for one in found.warnings if one.code == "unexplained"]
     assert all("noise.model" in text and "learner" not in text for text in texts)
+
+
+def test_standard_errors_suit_the_errors_unless_plain_ones_are_asked_for():
+    rng = np.random.default_rng(0)
+    u, e = rng.normal(size=1500), np.zeros(1500)
+    for k in range(1, 1500):
+        e[k] = 0.8 * e[k - 1] + 0.1 * rng.normal()
+    u = np.convolve(u, np.ones(10) / 10, "same")
+    record = oa.Record.from_arrays(u=u, y=2 * u + e, sampling_time=1.0)
+    physics = oa.Baseline.from_terms([oa.Term("g", "u[k]")])
+    fit = oa.estimate(record, physics, learner=None)
+    plain = oa.estimate(record, physics, learner=None, standard_errors="plain")
+    assert (fit.std_kind, plain.std_kind) == ("newey-west", "plain")
+    assert fit.std[0] > 2 * plain.std[0]
+    np.testing.assert_array_equal(fit.plain_std, plain.std)
+    assert fit.diagnose().parameters[0].std == pytest.approx(fit.std[0], rel=1e-12)
+    with pytest.raises(oa.InputError, match="standard_errors must be one of auto, plain"):
+        oa.estimate(record, physics, learner=None, standard_errors="HC3")

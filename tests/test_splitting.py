@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -31,6 +32,8 @@ from orthaug import (
     save,
     synthetic,
 )
+
+estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
 
 QUICK = LevenbergMarquardt()
 WIDE = Uniform({"u[k]": (-0.6, 0.6)})

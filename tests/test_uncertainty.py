@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,8 @@ from orthaug.inference.covariance import (
     newey_west,
     robust_split_covariance,
 )
+
+estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
 
 RIDGE = 1e-4
 NODE, SHARE = np.polynomial.legendre.leggauss(200)

@@ -50,6 +50,12 @@ def _findings(fit: Any, findings: Any, *, html: bool) -> str:
         return fit_text(fit, findings) or fit.status.message
 
 
+def _intervals(fit: Any) -> Any:
+    from orthaug.analysis.robustness import with_suited_errors
+
+    return with_suited_errors(fit)
+
+
 def _progress() -> Any:
     from orthaug.commands.bars import shown_progress
 
@@ -57,7 +63,7 @@ def _progress() -> Any:
 
 
 MAKERS.update(html=_html, plot=_plot, report=_report, progress=_progress)
-MAKERS.update(diagnose=_diagnose, findings=_findings)
+MAKERS.update(diagnose=_diagnose, findings=_findings, intervals=_intervals)
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -14,7 +14,9 @@ from typing import Any, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-MAKERS: dict[str, Callable[..., Any]] = {}  # html, plot, report, progress, diagnose, findings
+MAKERS: dict[
+    str, Callable[..., Any]
+] = {}  # html, plot, report, progress, diagnose, findings, intervals
 
 
 class NotebookView:

@@ -10,6 +10,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.parallel import one_blas_thread
+from orthaug.analysis.attempt import attempt
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.estimates import Estimate
@@ -30,6 +31,20 @@ _SHORT = 5  # steps of a block of errors that are white and of uneven size
 # errors that are independent and alike 5 % get robust standard errors by chance
 UNEVEN, _LEVEL = (0.03, 0.01)
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
+
+
+def with_suited_errors(fit: Any) -> Any:
+    """Return a fit of rows in memory with the standard errors that suit its errors.
+
+    As `robust_where_asked`; the fit as it is where that fails.
+    """
+    if isinstance(fit.problem, StreamedProblem) or not fit.status.ok:
+        return fit
+
+    def suited() -> Any:
+        return robust_where_asked(fit, fit.model.predict(fit.problem.record))
+
+    return attempt("the robust covariance", suited, [], fit)
 
 
 def robust_where_asked(fit: Estimate, response: Response) -> Estimate:

@@ -8,10 +8,10 @@ from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 
-from orthaug._base.checks import check_type
+from orthaug._base.checks import check_choice, check_type
 from orthaug._base.jax import release_programs
 from orthaug._base.progress import SILENT, ProgressCallback
-from orthaug._base.views import with_progress
+from orthaug._base.views import MAKERS, with_progress
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.data.sources import Source
@@ -76,6 +76,7 @@ class Options(TypedDict, total=False):
     engine: Engine | None
     noise: Noise
     controller: Controller | None
+    standard_errors: str
 
 
 @overload
@@ -109,6 +110,7 @@ def estimate(
     engine: Engine | None = None,
     noise: Noise = "white",
     controller: Controller | None = None,
+    standard_errors: str = "auto",
 ) -> Estimate:
     """Fit `y_k = φ(x_k)θ + learner(x_k) + e_k` to a record.
 
@@ -117,6 +119,10 @@ def estimate(
     θ is solved, never iterated: with the orthogonal structure it is the least-squares fit of
     physics alone, whatever the learner does. Equations of motion (`Motion`) are fitted on their
     free run, and their parameters are the physics nearest to the fitted motion.
+
+    Standard errors suit the errors of a record in memory: those for white noise, robust ones where
+    errors are coloured or of uneven size, none where they are correlated over too much of the
+    record. `std_kind` names them, and `plain_std` has those for white noise beside robust ones.
 
     Args:
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
@@ -168,6 +174,7 @@ def estimate(
         controller: of a `Motion` that was recorded in a loop, such as `Controller.pid(…)`: its free
             run is the loop's, from the references. The record's inputs are these and what else
             drives the plant; an input that the controller sets may be one of its outputs.
+        standard_errors: "auto" for those that suit the errors, "plain" for those of white noise.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -183,6 +190,7 @@ def estimate(
         '2.000'
     """
     release_programs()
+    check_choice(standard_errors, ("auto", "plain"), "standard_errors")
     if isinstance(baseline, System):
         baseline = baseline.motion(rows_in_memory(record))
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
@@ -197,7 +205,7 @@ def estimate(
         initial=model,
         engine=engine,
     )
-    return fit(
+    made = fit(
         problem,
         learner=learner,
         structure=structure,
@@ -215,6 +223,7 @@ def estimate(
         engine=engine,
         noise=noise,
     )
+    return made if standard_errors == "plain" else MAKERS["intervals"](made)
 
 
 @overload
