@@ -248,3 +248,10 @@ def test_what_the_log_may_be(monkeypatch, no_log):
         "",
         "error: ORTHAUG_LOG must be one of info, debug; got 'loud'.\n",
     )
+
+
+def test_a_number_and_its_per_cent_stay_on_one_line() -> None:
+    assert fold(["The intervals of 95 % count noise"], width=19) == [
+        "The intervals of",
+        "  95 % count noise",
+    ]

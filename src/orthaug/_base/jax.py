@@ -45,7 +45,7 @@ else:
     ArrayModule = Any  # NumPy, or JAX's
 
 _LENGTH = hashlib.sha256().digest_size
-_MAPS = 65_530  # of memory, that Linux grants a process unless it is told otherwise
+_MAPS = 65_530  # of memory, that Linux grants a process unless it is set otherwise
 _MOST_MAPS = 0.5  # of these, up to which programs stay: one fit with its diagnosis takes 0.1
 __all__ = [
     "AnyArray",

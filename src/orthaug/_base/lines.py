@@ -12,6 +12,8 @@ from itertools import zip_longest
 WIDTH = 100  # columns of what is printed, at most
 _NARROWEST = 40  # below, folded tables are harder to read than lines that the terminal breaks
 _screen = [WIDTH]
+_UNBROKEN = "\u00a0"
+_BEFORE_PERCENT = re.compile(r"(?<=\d) (?=%)")  # a number and its per cent stay together
 _LAST_CELL = re.compile(r"^.*\S {2,}(?=\S)|^ +(?=\S)")
 _LATEST = 64  # column at which the last cell of a row may begin for it to be folded there
 INTERVAL_HEAD = "95 % interval"  # of the column of intervals
@@ -278,8 +280,8 @@ def _fold(line: str, width: int) -> list[str]:
     indent = cell.end() if cell and cell.end() <= _LATEST else 0 if cell else 2
     if cell and not indent:  # a table of numbers: it cannot be broken
         return [line]
-    return textwrap.wrap(
-        line,
+    wrapped = textwrap.wrap(
+        _BEFORE_PERCENT.sub(_UNBROKEN, line),
         width,
         subsequent_indent=" " * indent,
         break_long_words=False,
@@ -288,3 +290,4 @@ def _fold(line: str, width: int) -> list[str]:
         expand_tabs=False,
         replace_whitespace=False,
     )
+    return [part.replace(_UNBROKEN, " ") for part in wrapped]

@@ -2,7 +2,7 @@
 
 A sensor of step q records `Q(y)`: to the nearest multiple (`round`), the one below or above
 (`floor`, `ceil`), or the one toward zero (`trunc`). Its error `Q(y) − y` is a function of the
-signal, not noise. The model's own free run ŷ tells what it is: Q(ŷ) − ŷ, which moves (c, w) by
+signal, not noise. The model's own free run ŷ shows what it is: Q(ŷ) − ŷ, which moves (c, w) by
 `(SᵀS)⁻¹Sᵀ(Q(ŷ) − ŷ)`. That is taken from the parameters, and ŷ made again, a few times: a
 truncating sensor scales the outputs, which the fit follows. The way that leaves least is named.
 """

@@ -495,7 +495,7 @@ def _account(
         count = len(np.unique(apart.finite))
         lines.append(f"{apart.header} numbers {count} experiments; their rows are read apart")
     if roles.sampling_time is None:
-        used.add(id(found.clock.faulty))  # the line of the sampling time tells its fault
+        used.add(id(found.clock.faulty))  # the line of the sampling time names its fault
     for column in (c for c in found.columns if id(c) not in used):
         lines.append(f"left out: {column.header} ({found.why_not(column)})")
     for column, delay, order, unsure in zip(

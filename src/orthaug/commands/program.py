@@ -348,7 +348,7 @@ def fail(before: str, text: str, exit_code: int, code: str | None) -> None:
 
     Args:
         before: the word before it for people.
-        code: that for programs; None for an error that a printed result has told already.
+        code: that for programs; None for an error that a printed result has said already.
     """
     WATCH.hold()
     streams.say(f"{before}: {text}" if before else text)

@@ -151,7 +151,7 @@ class Command:
 
 
 def _message_in(line: str) -> dict[str, Any] | None:
-    """Return what a line tells of the training: a run, a stage or a model; None for others."""
+    """Return what a line says of the training: a run, a stage or a model; None for others."""
     with suppress(ValueError):
         return json.loads(line) if line.startswith(('{"run"', '{"stage"', '{"model"')) else None
     return None
