@@ -430,13 +430,14 @@ def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[Family], l
         terms = memory_terms(name, joined, step)
         kinds = [(STATIC, (None,) * _FUNCTIONS)]
         kinds += [(kind, tuple(term for term in terms if term.kind == kind)) for kind in KINDS]
+        values = [
+            np.stack(_static(x, size) + [term.along(x, step) / size for term in terms], axis=1)
+            for x in (own[name] for own in signals)
+        ]
         for place, equation in _equations(model).doubted:
             families += [Family(equation, name, kind, own) for kind, own in kinds]
-            for found, own, run in zip(columns, signals, runs, strict=True):
-                values = _static(own[name], size) + [
-                    term.along(own[name], step) / size for term in terms
-                ]
-                found.append(_respond(model, run, place, np.stack(values, axis=1)))
+            for found, own, run in zip(columns, values, runs, strict=True):
+                found.append(_respond(model, run, place, own))
     changing, moved = changing_columns(model, runs, names, signals)
     families += changing
     for found, own in zip(columns, moved, strict=True):
