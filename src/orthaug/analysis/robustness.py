@@ -62,7 +62,12 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
         return robust_free_run(fit)
     lags, rows = _memory(fit, response), len(fit.problem.rows)
     if lags is not None:
-        return _robust(fit, lags) if rows >= max(_FEWEST_ROWS, _ROWS_PER_TERM * lags) else fit
+        most = rows // _ROWS_PER_TERM
+        if rows < _FEWEST_ROWS:
+            return fit
+        if lags > most:
+            return _withheld(fit, "one step ahead", f"over too much of the {rows} rows")
+        return _robust(fit, lags)
     errors = np.concatenate(errors_of(response)) @ fit.problem.weight.matrix.T
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING) or len(errors) != rows:
         return fit
@@ -104,7 +109,7 @@ def _by_colour(fit: Any) -> Any:
         found = _robust(fit, None, "autoregressive")
         if found.std_kind == "autoregressive" and found.freedom >= _FEWEST_INDEPENDENT:
             return found
-    return _withheld(fit)
+    return _too_long(fit)
 
 
 def _robust(fit: Estimate, lags: int | None, kind: str | None = None) -> Estimate:
@@ -142,8 +147,8 @@ def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
         )
 
 
-def _withheld(fit: Any) -> Any:
-    """Return the fit without standard errors, which says why."""
+def _too_long(fit: Any) -> Any:
+    """Return the fit of a free run without standard errors: its errors are correlated too long."""
     segments = fit.scores.segments
     lengths = [correlation_length(errors) for errors in fit.scores.errors()]
     known = [length for length in lengths if length is not None]
@@ -157,6 +162,17 @@ def _withheld(fit: Any) -> Any:
             f"over more than a segment of training ({fit.scores.longest} steps) or much of the "
             "record"
         )
+    return _withheld(fit, "of the free run", why, "longer segments, ")
+
+
+def _withheld(fit: Any, errors: str, why: str, longer: str = "") -> Any:
+    """Return the fit without standard errors, which says why.
+
+    Args:
+        errors: which they are, in words.
+        why: over how long they are correlated.
+        longer: a remedy beside a longer record.
+    """
     each = (
         ""
         if fit.std is None
@@ -169,8 +185,8 @@ def _withheld(fit: Any) -> Any:
         + ", which are too small."
     )
     text = (
-        "no standard errors and no intervals: the errors of the free run are correlated "
-        f"{why}.{each} Use longer segments, a longer record, or physics with smaller errors."
+        f"no standard errors and no intervals: the errors {errors} are correlated {why}.{each} Use "
+        f"{longer}a longer record, or physics with smaller errors."
     )
     return replace(
         fit,
@@ -182,7 +198,10 @@ def _withheld(fit: Any) -> Any:
 
 
 def _memory(fit: Estimate, response: Response) -> int | None:
-    """Return lags for the one-step residual; None where it is white, or rounding."""
+    """Return lags for the one-step residual; None where it is white, or rounding.
+
+    As many as there are rows where it is correlated over all lags that are looked at.
+    """
     memory = 0
     if np.all(rms_errors(response) / fit.problem.deviation < ROUNDING):
         return None
@@ -192,7 +211,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
             rows = sum(map(len, pieces))
             acf = np.asarray(autocorrelation(pieces, rows // ROWS_PER_LAG))
             quiet = np.abs(acf) < 2 / np.sqrt(rows)
-            memory = max(memory, int(np.argmax(np.append(quiet, True))))
+            memory = max(memory, int(np.argmax(quiet)) if quiet.any() else rows)
     return _MEMORIES * memory or None
 
 
