@@ -20,8 +20,10 @@ from orthaug.commands.advice import (
     ProposalErrors,
     ValidationRows,
     _conclude_trials,
+    _unique_proposals,
     apply_change,
 )
+from orthaug.commands.motion import _has_term
 from orthaug.reports.page_verdict import fit_verdict
 
 LAGGED = """
@@ -178,6 +180,20 @@ def test_what_the_spec_has_is_never_advised(tmp_path):
         [a.text for a in fitted.result.advice] + [trials, fit_verdict(fitted.result).then]
     )
     assert "sign(" not in told and "also sees" not in told and "focus" not in told
+
+
+def test_a_term_is_the_whole_term():
+    """`i*x` is no part of `q*i*x**2`, and was not tried though it was named as the nearest."""
+    own = "(Bl*i - r * v - k*x)/m + q*i*x**2 + size*(sign(v))"
+    states = ("i", "x", "v")
+    assert all(_has_term(own, term, states) for term in ("v", "i", "x", "i*x**2", "sign( v )"))
+    assert not any(_has_term(own, term, states) for term in ("i*x", "v**2", "x**2", "sign"))
+    assert _has_term("2*c*v/m - (a + b)*v", "v", states) and not _has_term("u", "v", states)
+
+
+def test_a_proposal_of_two_findings_has_the_place_of_the_first():
+    found = [Proposal("a", {"k": 1}), Proposal("b", {"k": 2}), Proposal("a", {"k": 3})]
+    assert _unique_proposals(found) == found[:2]
 
 
 def dead(u: float, width: float = 0.4) -> float:

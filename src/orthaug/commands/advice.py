@@ -87,7 +87,11 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
 
 
 def _unique_proposals(found: list[Proposal]) -> list[Proposal]:
-    return list({proposal.words: proposal for proposal in reversed(found)}.values())[::-1]
+    """Return the proposals in their order, each at the first of its places."""
+    first: dict[str, Proposal] = {}
+    for proposal in found:
+        first.setdefault(proposal.words, proposal)
+    return list(first.values())
 
 
 def _is_biased(result: FitResult) -> bool:
