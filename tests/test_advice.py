@@ -341,6 +341,21 @@ def test_a_change_that_runs_away_still_is_no_advice():
     assert [round(one.after, 2) for one in advice] == [0.02]
 
 
+def test_a_much_lower_error_without_sure_gain_says_why():
+    """A few rows are far better and the others worse."""
+    rng = np.random.default_rng(2)
+    base = [1e-3 * rng.uniform(0.5, 1.5, 60)]
+    base[0][5:12] *= 100
+    tried = [np.where(base[0] > 2e-3, 0.2, 1.5) * base[0]]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    advice, trials = _conclude_trials(
+        base, [ProposalErrors(Proposal("a term", {}), tried)], rows, 0, False
+    )
+    assert not advice, advice
+    assert "lower, but not surely on other rows" in trials.text
+
+
 CRANE = """
 [data]
 sampling_time = 0.02

@@ -428,7 +428,10 @@ def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = f"{text}. The data would determine {named} with such a learner, but not here: {reason}."
+    text = (
+        f"{text}. The data would determine {named} with such a learner. That is in doubt here: "
+        f"{reason}."
+    )
     physical = None if shared.physical is None else []
     update = {
         "text": text,
