@@ -20,8 +20,10 @@ from orthaug.commands.advice import (
     ProposalErrors,
     ValidationRows,
     _conclude_trials,
+    _unique_proposals,
     apply_change,
 )
+from orthaug.commands.motion import _has_term
 from orthaug.reports.page_verdict import fit_verdict
 
 LAGGED = """
@@ -180,6 +182,20 @@ def test_what_the_spec_has_is_never_advised(tmp_path):
     assert "sign(" not in told and "also sees" not in told and "focus" not in told
 
 
+def test_a_term_is_the_whole_term():
+    """`i*x` is no part of `q*i*x**2`, and was not tried though it was named as the nearest."""
+    own = "(Bl*i - r * v - k*x)/m + q*i*x**2 + size*(sign(v))"
+    states = ("i", "x", "v")
+    assert all(_has_term(own, term, states) for term in ("v", "i", "x", "i*x**2", "sign( v )"))
+    assert not any(_has_term(own, term, states) for term in ("i*x", "v**2", "x**2", "sign"))
+    assert _has_term("2*c*v/m - (a + b)*v", "v", states) and not _has_term("u", "v", states)
+
+
+def test_a_proposal_of_two_findings_has_the_place_of_the_first():
+    found = [Proposal("a", {"k": 1}), Proposal("b", {"k": 2}), Proposal("a", {"k": 3})]
+    assert _unique_proposals(found) == found[:2]
+
+
 def dead(u: float, width: float = 0.4) -> float:
     return u - np.clip(u, -width, width)
 
@@ -323,6 +339,21 @@ def test_a_change_that_runs_away_still_is_no_advice():
     tried = [ProposalErrors(Proposal("a hold", {}), errors(size)) for size in (1120.0, 0.02)]
     advice, _ = _conclude_trials(errors(1360.0), tried, rows, 0, False, slow=False)
     assert [round(one.after, 2) for one in advice] == [0.02]
+
+
+def test_a_much_lower_error_without_sure_gain_says_why():
+    """A few rows are far better and the others worse."""
+    rng = np.random.default_rng(2)
+    base = [1e-3 * rng.uniform(0.5, 1.5, 60)]
+    base[0][5:12] *= 100
+    tried = [np.where(base[0] > 2e-3, 0.2, 1.5) * base[0]]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    advice, trials = _conclude_trials(
+        base, [ProposalErrors(Proposal("a term", {}), tried)], rows, 0, False
+    )
+    assert not advice, advice
+    assert "lower, but not surely on other rows" in trials.text
 
 
 CRANE = """

@@ -28,6 +28,7 @@ from orthaug import (
     synthetic,
 )
 from orthaug.analysis.bias import bias_table
+from orthaug.analysis.bias_hull import Candidate, undetermined_warning
 from orthaug.analysis.budget import SURE_SHARE, budget_on
 from orthaug.analysis.catalogue import Catalogue
 from orthaug.analysis.causes import near_causes
@@ -400,3 +401,12 @@ def test_the_hull_holds_the_truth_or_says_that_it_is_not_determined(name):
     open_ones = [parameter for parameter in rows if not budget.of(parameter).determined]
     codes = [warning.code for warning in budget.warnings]
     assert ("not_determined" in codes) == bool(open_ones)
+
+
+def test_a_single_output_is_compared_with_no_other():
+    pair = [Candidate("u**2", 0.9, np.array([shift])) for shift in (0.1, -0.2)]
+    one, two = (
+        undetermined_warning(["b"], pair, (), entries=1, outputs=count).text for count in (1, 2)
+    )
+    assert "u**2 may be of several sizes" in one and "output" not in one
+    assert "u**2 in one output and in another imply different values" in two

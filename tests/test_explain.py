@@ -16,8 +16,8 @@ from orthaug._base.lines import narrow_screen
 from orthaug.analysis.findings import MemoryResult
 from orthaug.data.expressions import parse_named
 from orthaug.reports.explanation import ExplainResult, explain_text
-from orthaug.selection.explaining import _expression_text, candidates_of
-from orthaug.selection.explanation import NewTerm, SingleTerm, added_to_motion
+from orthaug.selection.explaining import Candidate, _expression_text, candidates_of
+from orthaug.selection.explanation import NewTerm, SingleTerm, _base_name, added_to_motion
 from orthaug.selection.learned_linearization import (
     MotionResponse,
     _move_parameters,
@@ -518,3 +518,10 @@ def test_a_narrow_table_keeps_a_share_with_its_term():
         rows[-1].startswith("57.4 %  position  a friction-like hysteresis (LuGre)")
         and len(rows) == 3
     )
+
+
+def test_a_jump_of_an_input_is_not_named_as_friction():
+    jump = Candidate("coulomb", "valve", None, 0, "sign(valve)")
+    assert _base_name(jump, ("valve",)) == "jump" and _base_name(jump, ()) == "coulomb"
+    peak = Candidate("stribeck_gauss", "valve", 0.5, 0, "sign(valve)*exp(-(valve/0.5)**2)")
+    assert _base_name(peak, ("valve",)) == "peak" and _base_name(peak, ("u",)) == "stribeck"

@@ -11,6 +11,8 @@ import pytest
 from test_cli import run, write_csv
 
 import orthaug as oa
+from orthaug.analysis.family_tests import Family, _test_families
+from orthaug.analysis.parameter_changes import _turn_of
 
 TS = 0.05
 DATA = '[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = 0.05\ntrain = { files = ["run.csv"] }\n'
@@ -134,3 +136,25 @@ def test_noise_alone_is_no_hidden_state(tmp_path, physics, data):
         and "unexplained" not in result
     )
     assert "noise only" not in text
+
+
+def test_a_base_that_blocks_do_not_determine_makes_no_family_look_good():
+    """Seven of eight blocks leave the base to chance, so any column seems to help in the eighth."""
+    rng = np.random.default_rng(0)
+    base = rng.normal(size=800)
+    base[:700] *= 0.01
+    term = np.where(np.arange(800) < 700, base, 0.0)
+    whole = np.column_stack([base, term, rng.normal(size=800)])
+    size = np.linalg.norm(whole, axis=0)
+    (found,) = _test_families(whole / size, [0], 1, [Family("", "u", "lag", (None,))], size, None)
+    assert 0 < found.share < 0.02 and not found.sure
+
+
+def test_a_curve_that_turns_far_beyond_its_ends_has_a_value_there():
+    t = np.linspace(-1, 1, 2001)
+    for linear, square in ((0.1, 1.0), (-0.1, -1.0)):
+        curve = 2.0 + linear * t + square * t**2
+        extreme = curve.min() if square > 0 else curve.max()
+        assert _turn_of(2.0, linear, square) == pytest.approx(extreme)
+    assert _turn_of(2.0, 1.0, 0.6) is None and _turn_of(2.0, 1.0, 0.1) is None
+    assert _turn_of(2.0, 0.0, 0.0) is None

@@ -483,6 +483,33 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     assert found.growing == 0 and not stability.warnings
 
 
+def _driven(rate, substeps):
+    """The stability of ẇ = `rate` on a square wave of its input, with steps of 0.1 s."""
+    given = [oa.PhysicalParameter("c", 1.0)]
+    motion = oa.Motion.from_equations(
+        [oa.State("w", rate)], [oa.Output("y", "w")], given, inputs=["u"]
+    )
+    model = moving(motion, substeps=substeps)
+    model = replace(model, numbers=model.numbers._replace(theta_aux=np.zeros(1)))
+    u = np.tile(np.repeat([1.0, -1.0], 20), 3)
+    record = oa.Record.from_arrays(u=u, y=np.zeros(120), sampling_time=0.1)
+    return motion_stability(model, np.zeros((5, 1)), np.zeros((5, 1)), record)
+
+
+def test_a_step_of_the_integrator_that_is_too_long_is_no_divergence():
+    """ẇ = u − w³ is bounded for every input, a Runge-Kutta step of it only for small ones."""
+    cubic = _driven("c*u - 10*w**3", 1)
+    assert cubic.diverges_at is None and cubic.searched > 300
+    assert "With 1 substep, as fitted, the integrator itself diverges from" in cubic.text
+    assert "give `substeps` = " in cubic.text
+
+
+def test_a_motion_that_diverges_does_so_with_finer_steps():
+    found = _driven("c*u - w + w**3", 4)
+    assert 0.385 < found.diverges_at < 1  # beyond the top of w − w³, for waves do not last
+    assert "substep" not in found.text and "million times" in dict(found.warnings)["small_margin"]
+
+
 def test_an_angle_integrates_and_does_not_decay():
     def told(*states):
         given = [oa.PhysicalParameter("c", 2.0)]

@@ -196,10 +196,16 @@ def test_a_term_of_a_motion_has_its_coefficient():
         ("N", "n[k-1]", None),
         ("", "1", ""),
         ("N", "1/x[k-1]", "N*m"),
+        ("m/s", "x[k-1]", "1/s"),
+        ("m/s", "x[k-1]*o[k-1]**2", "1/s"),
+        ("m/s", "sign(o[k-1])", "m/s"),
+        ("kg m/s", "x[k-1]", "kg/s"),
     ],
 )
 def test_units_of_coefficients(unit, text, expected):
-    assert coefficient_unit(unit, parse(text), {"v": "m/s", "x": "m", "n": ""}) == expected
+    assert (
+        coefficient_unit(unit, parse(text), {"v": "m/s", "x": "m", "n": "", "o": "1"}) == expected
+    )
 
 
 @pytest.mark.parametrize(

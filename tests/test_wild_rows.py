@@ -11,6 +11,8 @@ import scipy.signal
 from test_cli import run
 
 import orthaug as oa
+from orthaug.analysis.diagnosis import _marking
+from orthaug.data import Outliers, prepare
 
 
 def warned(wrong: float, at: int = 150) -> list[str]:
@@ -47,6 +49,26 @@ def test_spikes_of_a_sensor_are_named_by_the_free_run():
     fit = oa.estimate(record, baseline, learner=None, criterion=oa.Simulation())
     (text,) = (w.text for w in oa.diagnose(fit).warnings if w.code == "wild_rows")
     assert text.startswith("15 rows of 1498 make up") and f": row {at[0]};" in text
+
+
+def test_the_advice_names_a_threshold_where_the_default_marks_few():
+    """Beside a steep signal wrong samples are only a few deviations of their window off."""
+    random, t = np.random.default_rng(5), np.arange(1000)
+    y, at = np.sin(t / 8) + 1e-3 * random.normal(size=1000), np.arange(20, 980, 40)
+    y[at] += np.where(np.arange(len(at)) % 6, 0.9, 40.0)
+    record = oa.Record.from_arrays(u=np.zeros(1000), y=y, sampling_time=0.1)
+    rows = [(0, int(row)) for row in at]
+    first = _marking(record, 0, rows)
+    found = re.search(r"threshold = ([\d.]+), which marks (\d+) of these rows", first)
+    assert found and float(found[1]) < 4 and int(found[2]) > 15
+    assert "; the default of 4 marks 11. Or" in first
+    marked = prepare(record, Outliers(), missing="keep")
+    (experiment,) = marked.experiments
+    left = [row for row in rows if np.isfinite(experiment.outputs[row[1], 0])]
+    again = _marking(marked, 0, left)
+    assert again.startswith('give the step "outliers" threshold = ') and "instead of 4" in again
+    hidden = [(0, row) for row in (100, 200, 300)]  # samples as all others
+    assert "does not separate them from the signal" in _marking(marked, 0, hidden)
 
 
 def test_heavy_tails_alone_are_none():

@@ -124,19 +124,24 @@ def undetermined_warning(
     remedies: Sequence[str],
     *,
     entries: int,
+    outputs: int,
 ) -> Warning:
     """Return the warning on parameters that the hull leaves open, with reason and remedy.
 
     Args:
         entries: inputs of the learner.
+        outputs: of the model.
     """
     shown = first_words(names, _LISTED)
     apart = sorted(candidates, key=lambda c: float(np.sum(np.sign(c.moved) * c.moved**2)))
     pair = [apart[0], apart[-1]] if len(apart) > 1 else apart
     causes = " and ".join(f"{c.name} ({percent(c.share)} of what it found)" for c in pair)
-    if len({c.name for c in pair}) == 1:  # of several outputs
+    alike = len({c.name for c in pair}) == 1
+    if alike:
         causes = f"{pair[0].name} in one output and in another"
     of = f": {causes} imply different values" if len(pair) > 1 else ""
+    if alike and outputs == 1:
+        of = f": {pair[0].name} may be of several sizes" if len(pair) > 1 else ""
     cure = " or ".join(
         remedies
         or (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -13,19 +13,87 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import check_number
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp, padded_length, quick_jit
+from orthaug._base.lines import plural
 from orthaug.analysis.visited import MOST_STEPS, usable
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.model import Model
 from orthaug.models.on_records import RUNAWAY
+from orthaug.physics.motion import MOST_SUBSTEPS
 
 # Outputs of a stable linear model grow with its inputs, and 10⁶ times the largest is "diverged"
 _LARGEST_FACTOR = 1e4
 _SIDE_BY_SIDE = 16  # runs of one compiled call
 _MARGIN = 1.5  # a factor below is a warning
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
+_FINER, _REFINEMENTS = 4, 3  # times the substeps, and how often: rk4's error falls to 1/256 each
 
 Diverging = Callable[[list[float]], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """The factor on the inputs from which the free run leaves all bounds; None: nowhere.
+
+    It is searched up to `searched`. With the model's own `substeps` the integrator itself leaves
+    them from `coarse` on, and with `finer` ones it does not; None where that is not so.
+    """
+
+    factor: float | None
+    searched: float
+    coarse: float | None = None
+    substeps: int = 0
+    finer: int = 0
+
+
+def find_divergence(model: Model, record: Record, largest: float = 1024.0) -> Divergence:
+    """Return from where on the free run diverges, as far as finer steps confirm it.
+
+    A motion's integrator may leave all bounds where its solution does not: its steps are then too
+    long for the states that larger inputs reach. The run is repeated with four times the substeps
+    as long as the finding changes. What changes to the last is left out of what is `searched`.
+
+    Raises:
+        InputError: as `divergence_scaling`.
+    """
+    coarse = factor = divergence_scaling(model, record, largest)
+    motion = getattr(model.form, "motion", None)
+    if factor is None or motion is None or motion.scheme.discrete:
+        return Divergence(factor, float(largest))
+    own = substeps = model.form.substeps
+    for _ in range(_REFINEMENTS):
+        if substeps * _FINER > MOST_SUBSTEPS:
+            break
+        fine = _with_substeps(model, substeps * _FINER)
+        first = _first_rows(fine, record)
+        if bool(_find_diverging(fine, first, [factor])[0]):
+            return _confirmed(coarse, factor, largest, own, substeps)
+        substeps *= _FINER
+        changed = divergence_scaling(fine, record, largest)
+        if changed is None:
+            return _confirmed(coarse, None, largest, own, substeps)
+        factor = changed
+    return _confirmed(coarse, None, factor / _CLOSE, own, substeps)
+
+
+def _confirmed(
+    coarse: float | None, factor: float | None, searched: float, own: int, substeps: int
+) -> Divergence:
+    """Return a finding, with that of the model's own substeps where finer ones changed it."""
+    if substeps == own:
+        return Divergence(factor, float(searched))
+    return Divergence(factor, float(searched), coarse, own, substeps)
+
+
+def _with_substeps(model: Model, substeps: int) -> Model:
+    """Return a motion's model with other steps of its integrator."""
+    return replace(model, form=replace(model.form, substeps=substeps))
+
+
+def _first_rows(model: Model, record: Record) -> Record:
+    """Return the first rows of each experiment, as many as are searched."""
+    rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
+    return replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
 
 
 def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) -> float | None:
@@ -49,9 +117,7 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
         )
     if not model.form.states:
         return None
-    rows = max(MOST_STEPS // len(record.experiments), model.form.first_row + 1)
-    first = replace(record, experiments=tuple(e.rows(None, rows) for e in record.experiments))
-    diverges = partial(_find_diverging, model, first)
+    diverges = partial(_find_diverging, model, _first_rows(model, record))
     growing = _doubling_factors(float(largest))
     wild = diverges(growing)
     if not wild.any():
@@ -60,14 +126,15 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
     return _bisect(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
 
 
-def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, str]:
-    """Return a sentence on the factor, or that there is none up to `searched`.
+def describe_divergence(found: Divergence, driven: bool) -> tuple[str, str]:
+    """Return what a search for divergence has found, as a sentence or two.
 
     The second text is the code of a warning, or empty.
 
     A model that is not `driven`, by inputs, has none to scale: its own run leaves the bounds or
     does not.
     """
+    factor = found.factor
     if not driven:
         stays = "remains bounded" if factor is None else "diverges without inputs"
         return (
@@ -75,7 +142,7 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
             "small_margin" if factor is not None else "",
         )
     stays, times = (
-        ("remains bounded", searched)
+        ("remains bounded", found.searched)
         if factor is None
         else ("exceeds the training outputs a million times", factor)
     )
@@ -83,7 +150,15 @@ def margin(factor: float | None, searched: float, driven: bool) -> tuple[str, st
         f"The free run {stays} with the inputs' deviations from their means {times:.4g} times "
         "as large."
     )
-    return text, "small_margin" if factor is not None and factor < _MARGIN else ""
+    if found.coarse is not None:
+        text += (
+            f" That holds for {found.finer} substeps of the integrator. With "
+            f"{plural(found.substeps, 'substep')}, as fitted, the integrator itself diverges from "
+            f"{found.coarse:.4g} times on. For inputs that large give `substeps` = {found.finer} "
+            "in [motion]."
+        )
+    least = min(one for one in (factor, found.coarse, _MARGIN) if one is not None)
+    return text, "small_margin" if least < _MARGIN else ""
 
 
 def _doubling_factors(largest: float) -> list[float]:

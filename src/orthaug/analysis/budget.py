@@ -352,7 +352,10 @@ def budget_by(
     if open_ones:
         cure = terms_of(found[0], terms).remedies(found[0].entries[0], open_ones)
         seen = len(terms.fit.model.form.entries)
-        warnings.append(undetermined_warning(open_ones, candidates, cure, entries=seen))
+        count = len(terms.fit.model.outputs)
+        warnings.append(
+            undetermined_warning(open_ones, candidates, cure, entries=seen, outputs=count)
+        )
     entries = tuple(entry for causes in found for entry in causes.entries)
     return Budget(entries, found[0].share, parameters, physical, (*warnings, *unbounded))
 

@@ -13,7 +13,6 @@ is (`missing_terms`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import singledispatch
 from typing import Any
@@ -48,8 +47,10 @@ from orthaug.analysis.verdict_text import (
     free_run_words,
     words,
 )
-from orthaug.data.record import Experiment
+from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
+from orthaug.data.steps import Outliers
+from orthaug.data.wild import marked_by
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -74,6 +75,7 @@ _SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is 
 _HOLD = 0.5  # share of the squares in wild rows
 # Share of the rows that these are at most, and the number that is always few
 _FEW, _LEAST = (0.005, 6)
+_MARKS_MORE = 1.5  # times what the present threshold marks, from which on another one is advised
 _WILD = 20.0  # robust deviations; a normal residual reaches five
 _WILD_IN_RUN, _FEW_IN_RUN = 10.0, 0.02  # the same of a free run, whose lags do not repeat a row
 _MAD = 1.4826
@@ -216,7 +218,7 @@ def _of_motion(
     warnings += [coarse.warning] if coarse and coarse.warning else []
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
-    warnings += wild_rows(free_run, record.experiments, free_run=not fit.model.coloured)
+    warnings += wild_rows(free_run, record, free_run=not fit.model.coloured)
     if not white:
         given = fit.std is not None and bool(np.isfinite(fit.std).any())
         more = f" {_UNCOUNTED if given else _MOVED}" if explained else ""
@@ -334,10 +336,10 @@ def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
     seen = replace(seen, complete=complete)
     if verdict == "equation_noise" and seen.fit.criterion.simulates and seen.white:
         seen = replace(seen, changes=_toward_prediction(seen))
-    experiments = seen.fit.problem.record.experiments
-    wild = wild_rows(seen.one_step, experiments)
+    record = seen.fit.problem.record
+    wild = wild_rows(seen.one_step, record)
     if not wild and free_run is not None:
-        wild = wild_rows(free_run, experiments, free_run=True)
+        wild = wild_rows(free_run, record, free_run=True)
     if wild:  # a larger learner would follow them
         seen = replace(
             seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
@@ -555,9 +557,7 @@ def find_drift(response: Response, kind: str) -> tuple[Warning, ...]:
     return tuple(found)
 
 
-def wild_rows(
-    response: Response, experiments: Sequence[Experiment], *, free_run: bool = False
-) -> tuple[Warning, ...]:
+def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> tuple[Warning, ...]:
     """Return a warning for each output whose error comes mostly from a few distant rows.
 
     A wrong sample is one row of a free run's error, and as many more of a one-step residual as the
@@ -581,14 +581,43 @@ def wild_rows(
             or not np.median(size)
         ):
             continue
-        named = [experiments[rows[k][0]].where(rows[k][1]) for k in wild[:_NAMED]]
+        at = [rows[k] for k in wild]
+        named = [record.experiments[i].where(row) for i, row in at[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         what = "error of the free run" if free_run else "one-step residual"
         text = (
             f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
             f"squared {what} of {output.name}: {'; '.join(named)}{more}. Wrong "
-            'samples among them bias θ: mark them (step = "outliers" of data.prepare), or '
-            "leave them out."
+            f"samples among them bias θ: {_marking(record, j, at)}"
         )
         found.append(Warning("wild_rows", text))
     return tuple(found)
+
+
+def _marking(record: Record, output: int, rows: list[tuple[int, int]]) -> str:
+    """Return how to mark rows, with the threshold where the default or the spec's marks few."""
+    name = record.outputs[output].name
+    done = [
+        one.options
+        for one in record.prepared
+        if one.step == "outliers" and name in one.options.get("channels", [name])
+    ]
+    step = Outliers(**{key: done[-1][key] for key in ("window", "threshold")} if done else {})
+    now, best = marked_by(record, output, rows, step)
+    better = best.gain > _MARKS_MORE * max(now.gain, 0)
+    marks = f"marks {best.rows} of these rows"
+    marks += f" and {plural(best.others, 'other')}" if best.others else ""
+    by_hand = "empty their cells in the file (`missing` in [data])"
+    if done and better:
+        return (
+            f'give the step "outliers" threshold = {best.threshold:g} instead of '
+            f"{step.threshold:g}, which {marks}. For the rest, {by_hand}."
+        )
+    if done:
+        return f'the step "outliers" does not separate them from the signal, so {by_hand}.'
+    if better:
+        return (
+            f'mark them by step = "outliers" of data.prepare with threshold = {best.threshold:g}, '
+            f"which {marks}; the default of {step.threshold:g} marks {now.rows}. Or leave them out."
+        )
+    return 'mark them (step = "outliers" of data.prepare), or leave them out.'

@@ -333,7 +333,7 @@ def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
     name, place = names[drift.place], np.arange(len(now)) == drift.place
     ends = [
         float(fit.problem.values_at(now + np.where(place, moved, 0.0))[drift.place])
-        for moved in (drift.begin, drift.end)
+        for moved in (drift.begin, drift.end, *(() if drift.turn is None else (drift.turn,)))
     ]
     if not np.isfinite(ends).all():
         return []
@@ -348,11 +348,12 @@ def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
             f"state, dz/dt = ({what.on} - z)/{what.scale:.3g}, and {name} as a function of z."
         )
         return [Warning("hidden_state", text)]
+    between = "" if drift.turn is None else f"over {ends[2]:.3g} in between "
     text = (
-        f"{name} seems to change over the record: from {ends[0]:.3g} at its begin to {ends[1]:.3g} "
-        f"at its end, {share}. Its value is a mean, and its interval is that of a constant. Record "
-        "what it depends on, such as a temperature, and write that into the physics; or fit the "
-        "begin and the end on their own."
+        f"{name} seems to change over the record: from {ends[0]:.3g} at its begin {between}to "
+        f"{ends[1]:.3g} at its end, {share}. Its value is a mean, and its interval is that of a "
+        "constant. Record what it depends on, such as a temperature, and write that into the "
+        "physics; or fit the begin and the end on their own."
     )
     return [Warning("parameter_drift", text)]
 
@@ -445,7 +446,10 @@ def _withdraw(shared: SharedResult, reason: str) -> SharedResult:
         return shared
     text = _DETERMINED.sub("", shared.text).rstrip(".")
     named = ", ".join(lost)
-    text = f"{text}. The data would determine {named} with such a learner, but not here: {reason}."
+    text = (
+        f"{text}. The data would determine {named} with such a learner. That is in doubt here: "
+        f"{reason}."
+    )
     physical = None if shared.physical is None else []
     update = {
         "text": text,

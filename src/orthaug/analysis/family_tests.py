@@ -38,7 +38,8 @@ _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that 
 class FamilyTest:
     """A family of terms in one equation, and the `share` of the errors that it predicts.
 
-    The share is of the filtered errors' square, on held-out blocks.
+    The share is of the filtered errors' square, on held-out blocks, and at most that on all rows:
+    where a block's own base does not determine it, any further column seems to help.
 
     `error` is the standard error of the share, `p` that of the F-test, times the number of
     families. `moves` is by how much each parameter moves once the best `term` is fitted beside it,
@@ -200,7 +201,7 @@ def _test_families(
         p = scipy.special.fdtrc(
             rank, freedom, gained / rank / (max(total - gained, 1e-300) / freedom)
         )
-        share: Share = sums.share([len(blocks) + j for j in own], blocks)
+        share = _at_most(sums.share([len(blocks) + j for j in own], blocks), gained / total)
         chosen = max(own, key=lambda j: (terms[:, j] @ target) ** 2 / (terms[:, j] @ terms[:, j]))
         term = family.terms[chosen - (place - len(family.terms))]
         entry = FamilyTest(
@@ -213,6 +214,13 @@ def _test_families(
             )
         found.append(entry)
     return [replace(entry, p=min(entry.p * len(found), 1.0)) for entry in found]
+
+
+def _at_most(share: Share, most: float) -> Share:
+    """Return a share that is no larger than another, as sure as it was."""
+    if share.value <= most:
+        return share
+    return Share(most, share.error * most / share.value)
 
 
 def best_family(entries: list[FamilyTest]) -> FamilyTest | None:

@@ -17,7 +17,7 @@ from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
-from orthaug.analysis.boundedness import divergence_scaling, margin
+from orthaug.analysis.boundedness import Divergence, describe_divergence, find_divergence
 from orthaug.analysis.contraction import Contraction, contraction
 from orthaug.analysis.feedback import Feedback, feedback
 from orthaug.analysis.lipschitz import Lipschitz, lipschitz
@@ -64,7 +64,7 @@ def stability(
         response: the model's free run of the record, if it is there already.
         x: the record's usable regressors (N, nx) in the model's layout, if they are stacked
             already.
-        box, largest: as in `contraction` and `divergence_scaling`.
+        box, largest: as in `contraction` and `find_divergence`.
 
     Raises:
         InputError: no model; as the single checks.
@@ -82,16 +82,19 @@ def stability(
     model = model_of(model)
     gradients, run = lipschitz(model, record, x=x), feedback(model, record, response=response)
     contracts = contraction(model, record, box=box, along=run)
-    factor = divergence_scaling(model, record, largest)
+    divergence = find_divergence(model, record, largest)
     radius = None if run is None else radius_beyond(model, run.points.states, run.points.inputs)
-    checks = Stability(run, contracts, factor, float(largest), gradients, (), "", radius)
-    says = list(_sentences(checks, bool(model.inputs)))
+    factor, searched = divergence.factor, divergence.searched
+    checks = Stability(run, contracts, factor, searched, gradients, (), "", radius)
+    says = list(_sentences(checks, divergence, bool(model.inputs)))
     says += [(sentence, "") for sentence in (describe_beyond(model, radius),) if sentence]
     warnings = tuple(Warning(code, sentence) for sentence, code in says if code)
     return replace(checks, warnings=warnings, text="\n".join(sentence for sentence, _ in says))
 
 
-def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
+def _sentences(
+    checks: Stability, divergence: Divergence, driven: bool
+) -> Iterator[tuple[str, str]]:
     """Yield what the checks say, sentence by sentence; with the code of a warning, or nothing."""
     run, contracts = checks.feedback, checks.contraction
     if checks.lipschitz:
@@ -147,4 +150,4 @@ def _sentences(checks: Stability, driven: bool) -> Iterator[tuple[str, str]]:
             f"{worst}.",
             "",
         )
-    yield margin(checks.diverges_at, checks.searched, driven)
+    yield describe_divergence(divergence, driven)

@@ -18,7 +18,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.jax import Array, jax, jnp, quick_jit
 from orthaug._base.lines import percent
 from orthaug.analysis.beyond_training import describe_beyond, radius_beyond
-from orthaug.analysis.boundedness import divergence_scaling, margin
+from orthaug.analysis.boundedness import describe_divergence, find_divergence
 from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
@@ -78,16 +78,22 @@ def motion_stability(
     checks = _of_modes(model, x, u)
     if record is None or not record.inputs:
         return checks
-    factor = divergence_scaling(model, record, _LARGEST)
-    sentence, code = margin(factor, _LARGEST, driven=True)
+    divergence = find_divergence(model, record, _LARGEST)
+    sentence, code = describe_divergence(divergence, driven=True)
     inputs = [model.form.inputs(experiment, record) for experiment in record.experiments]
     radius = radius_beyond(model, x, np.concatenate(inputs))
     text = "\n".join(
         part for part in (checks.text, sentence, describe_beyond(model, radius)) if part
     )
     warnings = (*checks.warnings, *((Warning(code, sentence),) if code else ()))
-    found = {"diverges_at": factor, "searched": _LARGEST, "radius_beyond": radius}
-    return replace(checks, text=text, warnings=warnings, **found)
+    return replace(
+        checks,
+        text=text,
+        warnings=warnings,
+        diverges_at=divergence.factor,
+        searched=divergence.searched,
+        radius_beyond=radius,
+    )
 
 
 def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStability:

@@ -25,6 +25,7 @@ _DRIFT, _SCHEDULED = "drift", "scheduled"
 # Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
 _SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
 _LIKELY = 0.5  # p with which a family is worth a second look
+_BENT = 0.5  # of the distance of both ends: from there on a curve turns far beyond them
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,8 @@ class ParameterDrift:
     begin: float
     end: float
     follows: MemoryTerm | None = None
+    turn: float | None = None
+    """The difference where the curve turns, where that is far beyond both ends; None elsewhere."""
 
 
 def changing_columns(
@@ -164,10 +167,20 @@ def _change_of(candidates: Candidates, tests: Tests, best: FamilyTest) -> Parame
     taken = [*range(tests.known), *(tests.known + at[j] for j in chosen)]
     steps = least_squares(whole[:, taken], whole[:, -1]) * tests.size[-1] / tests.size[taken]
     middle, moved = candidates.shift[place] + steps[place], steps[tests.known :]
+    turn = None
     if best.term is None:
         linear, square = moved
         ends = middle - linear + square, middle + linear + square
+        turn = _turn_of(float(middle), float(linear), float(square))
     else:
         low, high = family.ranges[chosen[0]]
         ends = middle + moved[0] * low, middle + moved[0] * high
-    return ParameterDrift(place, best.share, float(ends[0]), float(ends[1]), best.term)
+    return ParameterDrift(place, best.share, float(ends[0]), float(ends[1]), best.term, turn)
+
+
+def _turn_of(middle: float, linear: float, square: float) -> float | None:
+    """Return the value of a curve over -1 to 1 where it turns, if that is far beyond its ends."""
+    if abs(linear) >= 2 * abs(square):
+        return None
+    beyond = abs(square) + linear**2 / (4 * abs(square)) - abs(linear)  # the nearer end
+    return middle - linear**2 / (4 * square) if beyond > _BENT * 2 * abs(linear) else None

@@ -87,7 +87,11 @@ def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
 
 
 def _unique_proposals(found: list[Proposal]) -> list[Proposal]:
-    return list({proposal.words: proposal for proposal in reversed(found)}.values())[::-1]
+    """Return the proposals in their order, each at the first of its places."""
+    first: dict[str, Proposal] = {}
+    for proposal in found:
+        first.setdefault(proposal.words, proposal)
+    return list(first.values())
 
 
 def _is_biased(result: FitResult) -> bool:
@@ -299,6 +303,7 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
 
 # Errors over the output's deviation: of a run that says nothing, and of one that leaves the output
 _NO_BETTER, _RUNS_AWAY = (0.95, 3.0)
+_MUCH_LOWER = 0.9  # of the present error: a gain that asks why it is not sure
 _TAMED = 0.1  # of the error of a run that runs away, above which one still runs away
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
@@ -529,7 +534,9 @@ def _conclude_trials(
         f"{_relative_clause(len(helps), len(tried))}."
     )
     if worse:
-        named = "; ".join(f"{one.proposal.words} ({_error_text(one)})" for one in worse[:_LISTED])
+        named = "; ".join(
+            f"{one.proposal.words} ({_error_text(one, before)})" for one in worse[:_LISTED]
+        )
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No sure gain over {_error(before)}: {named}{more}."
     if left:
@@ -588,14 +595,14 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> st
     )
 
 
-def _error_text(one: ProposalErrors) -> str:
-    return (
-        "no fit"
-        if one.pieces is None
-        else "diverges"
-        if math.isinf(one.error)
-        else _error(one.error)
-    )
+def _error_text(one: ProposalErrors, before: float) -> str:
+    """Return the error of a change without sure gain, and why a much lower one is not sure."""
+    if one.pieces is None:
+        return "no fit"
+    if math.isinf(one.error):
+        return "diverges"
+    lower = one.error < _MUCH_LOWER * before and one.error <= _NO_BETTER
+    return _error(one.error) + (", lower, but not surely on other rows" if lower else "")
 
 
 def _error(value: float) -> str:

@@ -501,7 +501,7 @@ def _account(
     for column, delay, order, unsure in zip(
         roles.inputs, model.delays, model.persistence, model.undetermined, strict=True
     ):
-        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay, unsure)}")
+        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay, unsure, order)}")
     if roles.every > 1:
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "
@@ -574,13 +574,20 @@ def _account(
     return "\n".join(lines)
 
 
-def _delay(delay: int | None, undetermined: bool) -> str:
+def _delay(delay: int | None, undetermined: bool, order: int) -> str:
+    from orthaug.selection.first_orders import PERSISTENCE
+
     if undetermined:
         return (
             "several lags of it act together, and the data do not determine the first: a dead "
             "time is not seen"
         )
     if delay is None:
+        if order < PERSISTENCE:
+            return (
+                "no lag of it is significant by itself, for its neighbouring lags are alike: the "
+                "input may act nevertheless"
+            )
         return "no lag of it is significant"
     last = (
         ", the largest that is tried: the true one may be later, or earlier where it acts weakly"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -107,13 +107,14 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         motion = self.motion
         if motion.functions is not None:
             return None
+        varying = (*motion.names_of_states, *motion.inputs)
         if place is None:
             places = usual_places(motion)
             place = equations_of(motion)[places[0]] if len(places) == 1 else None
         if place in [output.name for output in motion.outputs]:
             now = declared_output(job, str(place))
             own = now["expression"]
-            if f"*{''.join(expression.split())}" in "".join(own.split()):
+            if _has_term(own, expression, varying):
                 return None
             change = {
                 f"motion.outputs.{place}": now | {"expression": f"{own} + {name}*({expression})"},
@@ -126,7 +127,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return None
         key = motion.equation_key
         own = str(job.declaration["motion"]["states"][place][key])
-        if f"*{''.join(expression.split())}" in "".join(own.split()):
+        if _has_term(own, expression, varying):
             return None
         change = {
             f"motion.states.{place}.{key}": f"{own} + {name}*({expression})",
@@ -439,3 +440,15 @@ def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warnin
             )
             warnings.append(Warning("other_hold", text))
     return " ".join(sentences), warnings
+
+
+def _has_term(equation: str, expression: str, varying: Sequence[str]) -> bool:
+    """Return whether an equation has a constant times an expression.
+
+    `i*x` and `x**2` are not in `q*i*x**2`, whose i is among the `varying` states and inputs.
+    """
+    term = re.escape("".join(expression.split()))
+    factor = rf"(?!(?:{'|'.join(map(re.escape, varying))})\b)[\w.]+"
+    constant = rf"(?:\)|(?<![\w.*]){factor})(?:\*{factor})*"
+    whole = rf"{constant}\*(?:{term}|\({term}\))(?![\w.*(])"
+    return re.search(whole, "".join(equation.split())) is not None

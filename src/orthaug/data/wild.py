@@ -36,6 +36,7 @@ _REPEATS = 2  # single rows that repeat the one before, at least
 _MOVING = 0.01  # of the deviation of its steps: by less an output rests
 _BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
 _TWICE = 0.98  # share of rows that equal the one before, of those that should
+_BELOW = 0.97  # of a sample's distance: a threshold that marks it for sure
 _SAME = 3e-3  # of an output's deviation: what is left of it beside another one
 
 
@@ -141,6 +142,49 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
     if not np.isfinite(least) or least <= 0:
         return Outliers().threshold
     return float(f"{min(max(np.sqrt(max(others, 1.0) * least), 4.0), 0.9 * least):.2g}")
+
+
+@dataclass(frozen=True)
+class Marked:
+    """What a threshold of the step `outliers` marks: some of given rows, and `others`."""
+
+    threshold: float
+    rows: int
+    others: int
+
+    @property
+    def gain(self) -> int:
+        """Rows that are marked, less the others."""
+        return self.rows - self.others
+
+
+def marked_by(
+    record: Record, output: int, rows: Sequence[tuple[int, int]], step: Outliers
+) -> tuple[Marked, Marked]:
+    """Return what a step marks of an output, and what the threshold does that marks rows best.
+
+    Args:
+        record: data to which the step is applied.
+        output: place among the outputs.
+        rows: experiment and row of the samples that are to be marked.
+        step: its window is kept.
+    """
+    wrong, others = [], []
+    for i, experiment in enumerate(record.experiments):
+        distance, deviation = step.distances(experiment.outputs[:, output])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.nan_to_num(distance / deviation, nan=0.0, posinf=np.inf)
+        own = [row for at, row in rows if at == i]
+        wrong.append(ratio[own])
+        others.append(np.delete(ratio, own))
+    far, near = np.concatenate(wrong), np.concatenate(others)
+
+    def marked(threshold: float) -> Marked:
+        return Marked(threshold, int((far > threshold).sum()), int((near > threshold).sum()))
+
+    finite = far[np.isfinite(far) & (far > 0)]
+    tried = {float(f"{_BELOW * value:.2g}") for value in finite} | {step.threshold}
+    return marked(step.threshold), max(map(marked, sorted(tried)), key=lambda one: one.gain)
 
 
 def data_warnings(

@@ -34,12 +34,15 @@ def coefficient_unit(unit: str, term: Expression, units: Mapping[str, str]) -> s
         >>> from orthaug.data.expressions import parse
         >>> coefficient_unit("N", parse("v[k-1]*abs(x[k-1])"), {"v": "m/s", "x": "m"})
         'N/((m/s)*m)'
+        >>> coefficient_unit("bar/s", parse("p[k-1]*valve[k-1]"), {"p": "bar", "valve": "1"})
+        '1/s'
     """
     found = _unit(term.tree, units)
     if found is None or (found and not unit):
         return None
     powers = Counter({unit: 1} if unit else {})
     powers.subtract(found)
+    powers = _cancelled(powers)
     above = [_power(name, power) for name, power in powers.items() if power > 0]
     below = [_power(name, -power) for name, power in powers.items() if power < 0]
     if not below:
@@ -64,7 +67,8 @@ def _unit(node: ast.AST, units: Mapping[str, str]) -> Unit | None:
         return Counter()
     if isinstance(node, ast.Name | ast.Subscript):
         name = node.id if isinstance(node, ast.Name) else getattr(node.value, "id", "")
-        return Counter({units[name]: 1}) if units.get(name) else None
+        unit = units.get(name)
+        return None if not unit else Counter({unit: 1} if unit != "1" else {})
     if isinstance(node, ast.UnaryOp):
         return _unit(node.operand, units)
     if isinstance(node, ast.Call):
@@ -89,6 +93,27 @@ def _unit(node: ast.AST, units: Mapping[str, str]) -> Unit | None:
     sign = 1 if isinstance(node.op, ast.Mult) else -1
     together = {unit: left[unit] + sign * right[unit] for unit in left | right}
     return Counter({unit: power for unit, power in together.items() if power})
+
+
+def _cancelled(powers: Unit) -> Unit:
+    """Return powers of the parts of compound units, such as bar/s, where some of them cancel."""
+    parts: Unit = Counter()
+    for unit, power in powers.items():
+        for part, own in _parts(unit).items():
+            parts[part] += own * power
+    apart = sum(abs(own * power) for u, power in powers.items() for own in _parts(u).values())
+    cancels = sum(map(abs, parts.values())) < apart
+    return Counter({part: power for part, power in parts.items() if power}) if cancels else powers
+
+
+def _parts(unit: str) -> Unit:
+    """Return the parts of a unit with one stroke at most; others are their own only part."""
+    above, _, below = unit.partition("/")
+    if any(mark in above for mark in "()^") or not below.isalnum():
+        return Counter({unit: 1})
+    parts = Counter(part for part in above.replace("*", " ").split() if part != "1")
+    parts[below] -= 1
+    return parts
 
 
 def _power(name: str, power: object) -> str:

@@ -88,8 +88,8 @@ def _withdraw_claim(line: str, result: Findings) -> str:
     """Return a line of a fit without the claim that a doubt about shared directions withdraws."""
     if result.shared is not None and result.shared.doubt and line.startswith("shared "):
         line = (
-            f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: none, "
-            "see below"
+            f"{line.partition('; determined by the fit: ')[0]}; determined by the fit: in "
+            "doubt, see below"
         )
     return line
 
@@ -325,14 +325,18 @@ def _bias_lines(result: Findings) -> list[str]:
     what = ("learner found" if result.learns else "free run leaves") + (
         " in one equation" if len(causes) > 1 else ""
     )
+    doubted = result.shared is not None and bool(result.shared.doubt)
+    held = ", as far as the learner holds what the physics lacks" if doubted else ""
     for (cause, share), own in causes.items():
         if result.learns and share < SURE_SHARE:
             lines.append(
                 f"What the {what} looks most like {cause}: {percent(share)} of it. The bias in "
-                "this case:"
+                f"this case{held}:"
             )
         else:
-            lines.append(f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias:")
+            lines.append(
+                f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias{held}:"
+            )
         lines += _bias_table([row for row in own if row.value is not None])
     return lines
 

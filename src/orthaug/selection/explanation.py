@@ -262,6 +262,8 @@ _NAMES = {
     "stribeck_gauss": "stribeck",
     TERM: "term",
 }
+# Of an input, such as a valve, the same functions are no friction
+_OF_INPUTS = {"coulomb": "jump", "stribeck": "peak", "stribeck_gauss": "peak"}
 
 
 @dataclass(frozen=True)
@@ -510,7 +512,8 @@ def _terms(space: Space, chosen: Sequence[Candidate], fitted: Fit) -> tuple[Expl
     linearization, before, found = space.linearization, 0.0, []
     taken = [*linearization.units, *(p.name for p in linearization.parameters)]
     taken += linearization.physics.names_taken
-    names = names_for([_base_name(one) for one in chosen], taken)
+    inputs = getattr(linearization.physics, "inputs", ())
+    names = names_for([_base_name(one, inputs) for one in chosen], taken)
     columns = [space.column(one) for one in chosen]
     std = (
         None if fitted.covariance is None else np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
@@ -544,7 +547,9 @@ def _scale(kind: str, on: str | None, text: str) -> str:
     return on if kind in ("dead_zone", "saturation") and on is not None else text
 
 
-def _base_name(candidate: Candidate) -> str:
+def _base_name(candidate: Candidate, inputs: Sequence[str]) -> str:
+    if candidate.on in inputs and candidate.kind in _OF_INPUTS:
+        return _OF_INPUTS[candidate.kind]
     return "offset" if candidate.text == CONSTANT else _NAMES.get(candidate.kind, candidate.kind)
 
 

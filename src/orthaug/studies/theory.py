@@ -99,7 +99,7 @@ THEORY: tuple[Statement, ...] = (
         "cond:stable_sys",
         "The data-generating system forgets its initial state exponentially.",
         "Of the fitted model: analysis.contraction.contraction, "
-        "analysis.boundedness.divergence_scaling, analysis.feedback.feedback",
+        "analysis.boundedness.find_divergence, analysis.feedback.feedback",
         "tests/test_free_run_stability.py. The true system is not at hand: out of a program's "
         "scope",
     ),
