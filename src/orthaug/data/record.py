@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -78,6 +79,16 @@ def steps_between(instants: Vector) -> tuple[float, Vector]:
     return float(steps.mean()), np.append(steps, steps[-1])
 
 
+def _other_name(name: str) -> str:
+    """Return what to call the channel of a column with such a name, as a sentence; or nothing."""
+    words = "_".join(re.findall(r"[A-Za-z0-9]+", str(name)))[:LONGEST]
+    other = words if is_name(words) else f"the_{words}"[:LONGEST]
+    if not words or not is_name(other):
+        return ""
+    column = visible(str(name))
+    return f' Call it {other}, and give the name in the file as its column: column = "{column}".'
+
+
 @dataclass(frozen=True)
 class Channel:
     """A named signal with its unit, and its form in files.
@@ -100,7 +111,7 @@ class Channel:
             raise InputError(
                 f"{_quote(self.name)} cannot name a channel; use letters, digits and "
                 f"underscores, at most {LONGEST}, not starting with a digit, and none of "
-                f"{', '.join(sorted(RESERVED))}. A column of another name is its `column`."
+                f"{', '.join(sorted(RESERVED))}.{_other_name(self.name)}"
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")
