@@ -200,6 +200,8 @@ def test_a_term_of_a_motion_has_its_coefficient():
         ("m/s", "x[k-1]*o[k-1]**2", "1/s"),
         ("m/s", "sign(o[k-1])", "m/s"),
         ("kg m/s", "x[k-1]", "kg/s"),
+        ("m/s²", "v[k-1]", "1/s"),
+        ("m/s2", "v[k-1]", "1/s"),
     ],
 )
 def test_units_of_coefficients(unit, text, expected):

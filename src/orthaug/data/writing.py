@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import unicodedata
 from collections import Counter
 from collections.abc import Mapping
 from fractions import Fraction
@@ -111,9 +112,20 @@ def _parts(unit: str) -> Unit:
     above, _, below = unit.partition("/")
     if any(mark in above for mark in "()^") or not below.isalnum():
         return Counter({unit: 1})
-    parts = Counter(part for part in above.replace("*", " ").split() if part != "1")
-    parts[below] -= 1
+    parts: Unit = Counter()
+    for part in above.replace("*", " ").split():
+        if part != "1":
+            name, power = _base(part)
+            parts[name] += power
+    name, power = _base(below)
+    parts[name] -= power
     return parts
+
+
+def _base(part: str) -> tuple[str, int]:
+    """Return a unit's name and power: s and 2 of s² and of s2."""
+    name, last = part[:-1], part[-1]
+    return (name, int(unicodedata.normalize("NFKC", last))) if last in "²³23" else (part, 1)
 
 
 def _power(name: str, power: object) -> str:
