@@ -214,3 +214,24 @@ def test_definitions_may_need_each_other_in_a_long_chain():
     long = oa.Motion.from_equations(states, outputs, [k], define=chain)
     assert long.rates(np.array([1.0]), np.zeros(0), long.initial, np) == pytest.approx(-2 * 3000.0)
     assert long.observed(np.array([1.0]), np.zeros(0), long.initial, np) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"outputs": ["y"]}, '`outputs` must be a list such as [Output("y", "x")]; got \'y\''),
+        ({"states": {"x": "u"}}, "`states` must be a list such as"),
+        ({"parameters": ["a"]}, "`parameters` must be a list such as"),
+        ({"inputs": "u"}, '`inputs` must be a list such as ["u"]'),
+    ],
+)
+def test_what_is_no_list_of_declarations_is_named(given, text):
+    options = {
+        "states": [oa.State("x", "u - a*x", start="y")],
+        "outputs": [oa.Output("y", "x")],
+        "inputs": ["u"],
+        "parameters": [oa.PhysicalParameter("a", 1.0)],
+    }
+    with pytest.raises(oa.InputError) as error:
+        oa.Motion.from_equations(**options | given)
+    assert text in str(error.value)

@@ -43,3 +43,17 @@ def test_standard_errors_suit_the_errors_unless_plain_ones_are_asked_for():
     assert fit.diagnose().parameters[0].std == pytest.approx(fit.std[0], rel=1e-12)
     with pytest.raises(oa.InputError, match="standard_errors must be one of auto, plain"):
         oa.estimate(record, physics, learner=None, standard_errors="HC3")
+
+
+def test_plain_standard_errors_of_coloured_errors_come_with_a_warning():
+    rng = np.random.default_rng(2)
+    e = np.zeros(90)
+    for k in range(1, 90):
+        e[k] = 0.8 * e[k - 1] + 0.1 * rng.normal()
+    u = rng.normal(size=90)
+    record = oa.Record.from_arrays(u=u, y=2 * u + e, sampling_time=1.0)
+    fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
+    assert fit.std_kind == "plain"
+    (text,) = [one.text for one in fit.warnings if one.code == "coloured_residual"]
+    assert "rough guide" in text and "rough guide" in fit.summary().replace("\n  ", " ")
+    assert [one.code for one in fit.diagnose().warnings].count("coloured_residual") <= 1

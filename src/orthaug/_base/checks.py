@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -143,6 +143,14 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
 def positive(scale: Vector) -> Vector:
     """Return the scale, 1 where it is not positive or not finite."""
     return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
+
+
+def check_all(values: Any, kind: type, name: str, example: str) -> None:
+    """Raise InputError unless `values` is a sequence of a kind, such as [example]."""
+    listed = isinstance(values, Sequence) and not isinstance(values, str)
+    wrong = [value for value in values if not isinstance(value, kind)] if listed else [values]
+    if wrong:
+        raise InputError(f"`{name}` must be a list such as [{example}]; got {show(wrong[0])}.")
 
 
 def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:

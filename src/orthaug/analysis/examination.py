@@ -90,7 +90,8 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     known, record = evidence.warnings, fit.problem.record
     if not fit.criterion.one_step:
         known = of_free_run(known, record.prepared, [channel.name for channel in record.channels])
-    warnings: list[Warning] = [*known, *fit.warnings]
+    own = (warning for warning in fit.warnings if warning.code != "coloured_residual")
+    warnings: list[Warning] = [*known, *own]
     scores, responses = {}, {}
     if fit.status.ok:
         for part in evidence.parts:

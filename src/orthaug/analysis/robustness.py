@@ -30,6 +30,10 @@ _SHORT = 5  # steps of a block of errors that are white and of uneven size
 # Levels of White's test, and of the test whether a residual is white, of all outputs together: of
 # errors that are independent and alike 5 % get robust standard errors by chance
 UNEVEN, _LEVEL = (0.03, 0.01)
+_ROUGH = (
+    "the errors are coloured, and there are no robust standard errors of them: those given assume "
+    "white errors and are a rough guide."
+)
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 
 
@@ -41,8 +45,15 @@ def with_suited_errors(fit: Any) -> Any:
     if isinstance(fit.problem, StreamedProblem) or not fit.status.ok:
         return fit
 
+    ahead = fit.criterion.free_run is None or fit.model.coloured
+    run = fit.model.predict if ahead else fit.model.simulate
+
     def suited() -> Any:
-        return robust_where_asked(fit, fit.model.predict(fit.problem.record))
+        response = run(fit.problem.record)
+        found = robust_where_asked(fit, response)
+        if found.std is None or found.std_kind != "plain" or _memory(fit, response) is None:
+            return found
+        return replace(found, warnings=(*found.warnings, Warning("coloured_residual", _ROUGH)))
 
     return attempt("the robust covariance", suited, [], fit)
 

@@ -209,6 +209,11 @@ def prediction_std(model: Model | HoldsModel, record: Record) -> list[Matrix]:
         InputError: no model, or one without statistics; other channels.
     """
     model = model_of(model)
+    if not isinstance(model.form, LaggedDynamics):
+        raise InputError(
+            "`prediction_std` is for physics in lagged values; of equations of motion an "
+            "`Observer` gives states with their standard deviations."
+        )
     joint = model.statistics.joint(len(model.theta))
     if joint is None or model.numbers.tilt is not None:
         raise InputError(

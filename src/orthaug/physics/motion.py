@@ -16,7 +16,15 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from orthaug._base.checks import Vector, check_choice, check_label, check_unique, is_number, nearest
+from orthaug._base.checks import (
+    Vector,
+    check_all,
+    check_choice,
+    check_label,
+    check_unique,
+    is_number,
+    nearest,
+)
 from orthaug._base.errors import InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
@@ -190,6 +198,10 @@ class Motion(NotebookView):
                 parameters that no equation uses, an output that no state enters.
         """
         constants, define = dict(constants or {}), dict(define or {})
+        check_all(states, State, "states", 'State("x", "u - a*x")')
+        check_all(outputs, Output, "outputs", 'Output("y", "x")')
+        check_all(parameters, PhysicalParameter, "parameters", 'PhysicalParameter("a", 1.0)')
+        check_all(inputs, str, "inputs", '"u"')
         plain = cls._from_declared(
             states,
             outputs,
