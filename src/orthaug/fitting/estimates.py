@@ -236,7 +236,13 @@ class Estimate(FitView):
         """
         kinds = self.robust_kinds
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
-        statistics = self.model.statistics
+        statistics = self._white_statistics
+        if self.std_kind == "none":
+            raise InputError(
+                "no kind of standard errors holds for this fit: its errors are correlated over too "
+                "much of the record, as its warning says. Use a longer record, or physics with "
+                "smaller errors."
+            )
         if (
             self.scores is None
             or self.covariance is None
