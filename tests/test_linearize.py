@@ -165,6 +165,21 @@ def test_the_entries_of_physics_alone_have_the_intervals_of_theta(linear):
     assert list(shifts) == [1.0, 1.0]
 
 
+def test_robust_intervals_of_physics_alone_are_those_of_its_entries(linear):
+    robust = linear.robust()
+    view = oa.linearize(robust)[0]
+    columns = {name: i for i, name in enumerate((*view.states, "u", "w"))}
+    expected = robust.parameters.loc["q0", ["ci95_low", "ci95_high"]].to_numpy(dtype=float)
+    band = view.matrix_ci95[columns["q[k-1]"], columns["q[k-1]"]]
+    np.testing.assert_allclose(band, expected, rtol=1e-8)
+
+
+def test_a_fit_without_standard_errors_has_no_bands(linear):
+    found = oa.linearize(replace(linear, covariance=None, std_kind="none"))
+    assert found[0].matrix_ci95 is None
+    assert [one.code for one in found.warnings] == ["no_intervals"]
+
+
 def test_derivatives_are_those_of_finite_differences(cubic):
     """Everything is computed again with θ and weights moved, the equilibrium with them."""
     model, at = cubic.model, {"u": 0.4}

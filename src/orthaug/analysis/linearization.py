@@ -146,23 +146,37 @@ def _spread(model: Model, fit: Estimate | None) -> tuple[_Spread | None, list[Wa
             "differences replace them, and there are no intervals."
         )
         return None, [Warning("no_intervals", text)]
+    if fit is not None and fit.std_kind == "none":
+        text = (
+            "the errors of the fit are correlated over too much of the record for standard errors; "
+            "there are no intervals."
+        )
+        return None, [Warning("no_intervals", text)]
+    if fit is not None and fit.plain_covariance is not None and not fit.learns:
+        assert fit.covariance is not None
+        return _Spread(_root(fit.covariance), float(fit.freedom), False), []
     if joint is not None and model.numbers.tilt is None:
         root = joint.root()
         if np.isfinite(root).all():
             return _Spread(root, model.statistics.freedom, False), []
     covariance = None if fit is None else fit.covariance
     if fit is not None and covariance is not None and np.isfinite(covariance).all() and nt:
-        values, vectors = np.linalg.eigh(covariance)
         text = (
             "there is no joint covariance with the learner's weights; intervals are those of "
             "θ, with the learner frozen."
         )
-        spread = _Spread(vectors * np.sqrt(np.maximum(values, 0.0)), float(fit.freedom), True)
+        spread = _Spread(_root(covariance), float(fit.freedom), True)
         return spread, [Warning("learner_frozen", text)]
     text = (
         "the model has no covariance (an ensemble, or trained elsewhere); there are no intervals."
     )
     return None, [Warning("no_intervals", text)]
+
+
+def _root(covariance: Matrix) -> Matrix:
+    """Return R with `R Rᵀ` = the covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def _view(
