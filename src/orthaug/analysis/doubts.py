@@ -79,7 +79,7 @@ def doubt(made: E) -> E:
     unmodelled = result.residuals is not None and result.residuals.verdict == "unmodelled"
     if test is not None and test.is_far and fit.model.coloured and not unmodelled:
         test = None  # disturbances add up along a free run, which innovations do not show
-    left = _static_share(result) if unmodelled and not _is_slow(fit, test) else 0.0
+    left = _static_share(result) if unmodelled else 0.0
     known = {warning.code for warning in result.warnings}
     warnings: list[Warning] = list(failed)
     if (unmodelled or (test is not None and test.found)) and "unexplained" not in known:
@@ -185,11 +185,12 @@ def _noise_only(
 def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result: Findings) -> str:
     given = _has_intervals(result)
     only = _ONLY if given else ""
-    if left > _LEFT:
+    slow = _is_slow(fit, test)
+    if left > _LEFT and not slow:
         what = f"the model's error contains more than noise: {_functions_text(left)}"
     elif test is None or not test.found:
         what = _more_than_noise(result)
-        if _is_disturbance(fit, result, slow=_is_slow(fit, test)):
+        if _is_disturbance(fit, result, slow=slow):
             kind = "innovations" if result.motion is not None else "auto"
             return (
                 f"{what}, and neither the inputs nor functions of the regressors predict it: a "

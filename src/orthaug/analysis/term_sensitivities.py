@@ -110,7 +110,8 @@ def sensitivities(
             else None
             for i in equations
         ]
-        halves = form.durations(u) / 2
+        steps = form.sampling_time if segmented.record.even else form.durations(u)
+        halves = np.broadcast_to(np.asarray(steps) / 2, u.shape[:2])
         columns = _propagate(to_next, to_output, added, at_ends, equations, acting, halves, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():

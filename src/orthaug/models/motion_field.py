@@ -66,7 +66,7 @@ class MotionField:
         return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
 
     def durations(self, rows: Any) -> Any:
-        """Return the seconds (…,) that each step takes, of the rows (…, r) that steps read."""
+        """Return the seconds (…,) that each step takes, of rows (…, r) that carry its pace."""
         return np.broadcast_to(self.sampling_time * self.split_pace(rows)[1], rows.shape[:-1])
 
     def external(self, u: Any) -> Any:
