@@ -50,10 +50,10 @@ def _findings(fit: Any, findings: Any, *, html: bool) -> str:
         return fit_text(fit, findings) or fit.status.message
 
 
-def _intervals(fit: Any) -> Any:
+def _intervals(fit: Any, *, ordered: bool = True) -> Any:
     from orthaug.analysis.robustness import with_suited_errors
 
-    return with_suited_errors(fit)
+    return with_suited_errors(fit, ordered=ordered)
 
 
 def _progress() -> Any:

@@ -37,10 +37,13 @@ _ROUGH = (
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 
 
-def with_suited_errors(fit: Any) -> Any:
+def with_suited_errors(fit: Any, *, ordered: bool = True) -> Any:
     """Return a fit of rows in memory with the standard errors that suit its errors.
 
     As `robust_where_asked`; the fit as it is where that fails.
+
+    Args:
+        ordered: whether the order of the rows means something, so that errors have a colour.
     """
     if isinstance(fit.problem, StreamedProblem) or not fit.status.ok:
         return fit
@@ -50,15 +53,20 @@ def with_suited_errors(fit: Any) -> Any:
 
     def suited() -> Any:
         response = run(fit.problem.record)
-        found = robust_where_asked(fit, response)
-        if found.std is None or found.std_kind != "plain" or _memory(fit, response) is None:
+        found = robust_where_asked(fit, response, ordered=ordered)
+        if (
+            not ordered
+            or found.std is None
+            or found.std_kind != "plain"
+            or _memory(fit, response) is None
+        ):
             return found
         return replace(found, warnings=(*found.warnings, Warning("coloured_residual", _ROUGH)))
 
     return attempt("the robust covariance", suited, [], fit)
 
 
-def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
+def robust_where_asked(fit: Estimate, response: Response, *, ordered: bool = True) -> Estimate:
     """Return the fit with standard errors that suit its errors: plain, or robust.
 
     Robust ones hold under colour or uneven size.
@@ -66,12 +74,13 @@ def robust_where_asked(fit: Estimate, response: Response) -> Estimate:
     One step ahead that is HC3 where White's test finds that the size of the errors goes with what
     moves θ, and Newey and West where they are coloured and the rows suffice. `response` is the
     prediction of the training rows. With a noise model they are plain: those of its innovations.
+    Rows that are not `ordered` have no colour.
     """
     if not fit.status.ok or fit.covariance is None or not fit.robust_kinds:
         return fit
     if fit.criterion.free_run is not None:
         return robust_free_run(fit)
-    lags, rows = _memory(fit, response), len(fit.problem.rows)
+    lags, rows = _memory(fit, response) if ordered else None, len(fit.problem.rows)
     if lags is not None:
         most = rows // _ROWS_PER_TERM
         if rows < _FEWEST_ROWS:

@@ -174,7 +174,9 @@ def estimate(
         controller: of a `Motion` that was recorded in a loop, such as `Controller.pid(…)`: its free
             run is the loop's, from the references. The record's inputs are these and what else
             drives the plant; an input that the controller sets may be one of its outputs.
-        standard_errors: "auto" for those that suit the errors, "plain" for those of white noise.
+        standard_errors: "auto" for those that suit the errors; "unordered" does not ask for their
+            colour, for rows whose order means nothing; "plain" for those of white noise, which
+            `diagnose()` replaces by those that suit.
 
     Raises:
         InputError: data and physics that do not fit together; RankError where θ is not determined.
@@ -190,7 +192,7 @@ def estimate(
         '2.000'
     """
     release_programs()
-    check_choice(standard_errors, ("auto", "plain"), "standard_errors")
+    check_choice(standard_errors, ("auto", "plain", "unordered"), "standard_errors")
     if isinstance(baseline, System):
         baseline = baseline.motion(rows_in_memory(record))
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
@@ -223,7 +225,9 @@ def estimate(
         engine=engine,
         noise=noise,
     )
-    return made if standard_errors == "plain" else MAKERS["intervals"](made)
+    if standard_errors == "plain":
+        return made
+    return MAKERS["intervals"](made, ordered=standard_errors == "auto")
 
 
 @overload

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.views import MAKERS
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import ROBUST_FREE_RUN, WITHHELD, Estimate, left_out
 from orthaug.inference.covariance import (
@@ -110,7 +111,8 @@ class LaggedEstimate(Estimate):
         joint = self.model.statistics.joint(len(self.theta))
         under = split_by_measure(measure, self.model, support, joint)
         if under.covariance is not None:
-            training = self.covariance if self.measure is None else None
+            white = self.measure is None and self.plain_covariance is None
+            training = self.covariance if white else None
             training = (
                 split_by_measure(Training(), self.model, support, joint).covariance
                 if training is None
@@ -126,7 +128,7 @@ class LaggedEstimate(Estimate):
         text = "no standard errors after a split: an ensemble has no gradient in its weights."
         unknown = (Warning("no_standard_errors", text),) if ensemble else ()
         numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
-        return replace(
+        made = replace(
             self,
             model=replace(
                 self.model, numbers=numbers, structure="orthogonal", measure=measure.name
@@ -142,6 +144,8 @@ class LaggedEstimate(Estimate):
                 *unknown,
             ),
         )
+        coloured = self.std_kind == "newey-west" and made.covariance is not None
+        return MAKERS["intervals"](made) if coloured else made
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._base.checks import check_type
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features, Lags
 from orthaug.fitting.lagged_estimate import LaggedEstimate
@@ -36,6 +37,7 @@ def orthogonalize(
         physics to it, and the learner what that leaves, `g − φθ`. There are no standard errors:
         they belong to how `function` was trained.
     """
+    check_type(baseline, Baseline, "baseline", "physics in lagged values, a Baseline")
     problem = pose(record, baseline, lags)
     ny, nz = len(problem.outputs), len(problem.features.entries)
     external = External(function, ny=ny)

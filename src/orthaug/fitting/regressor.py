@@ -103,7 +103,8 @@ class AugmentedRegressor(Augmented):
         outputs = output_names(given, y.shape[1], names)
         record = Record.from_arrays(X, y, inputs=names, outputs=outputs)
         baseline = baseline_of(self.physics, _NOW.layout(outputs, names), outputs, names)
-        self._estimate(record, baseline, _NOW, learner_of(self.learner, names))
+        learner = learner_of(self.learner, names)
+        self._estimate(record, baseline, _NOW, learner, standard_errors="unordered")
         self.output_names_ = outputs
         return self
 
