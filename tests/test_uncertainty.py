@@ -679,7 +679,7 @@ def test_robust_errors_of_a_split_come_from_the_influence_of_every_row(noisy):
     np.testing.assert_allclose(found, noisy.robust().covariance, rtol=1e-6)
     moved = other("split")
     np.testing.assert_allclose(moved.robust().std, moved.std, rtol=0.3)
-    assert moved.robust().split(Training()).plain_covariance is None
+    assert moved.robust().split(Training()).std_kind in ("plain", "hc3")  # these errors are white
 
 
 @pytest.mark.parametrize("lags", [-1, 2.5, True, "4"])
