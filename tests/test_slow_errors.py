@@ -57,3 +57,14 @@ def test_plain_standard_errors_of_coloured_errors_come_with_a_warning():
     (text,) = [one.text for one in fit.warnings if one.code == "coloured_residual"]
     assert "rough guide" in text and "rough guide" in fit.summary().replace("\n  ", " ")
     assert [one.code for one in fit.diagnose().warnings].count("coloured_residual") <= 1
+
+
+def test_a_notebook_names_robust_standard_errors():
+    rng = np.random.default_rng(0)
+    u, e = rng.normal(size=1500), np.zeros(1500)
+    for k in range(1, 1500):
+        e[k] = 0.8 * e[k - 1] + 0.1 * rng.normal()
+    record = oa.Record.from_arrays(u=u, y=2 * u + e, sampling_time=1.0)
+    fit = oa.estimate(record, oa.Baseline.from_terms([oa.Term("g", "u[k]")]), learner=None)
+    assert "Newey-West" in fit._repr_html_()
+    assert fit.split(oa.Training()).std[0] == pytest.approx(fit.std[0], rel=1e-9)

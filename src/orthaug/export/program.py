@@ -128,6 +128,16 @@ class Program:
     preparation: str = ""
     """Preparation of the data that inputs, outputs and state refer to, in words."""
 
+    def __repr__(self) -> str:
+        names = (
+            ", ".join(signal.name for signal in group) for group in (self.inputs, self.outputs)
+        )
+        inputs, outputs = names
+        return (
+            f"Program({self.name!r}: {inputs or 'no inputs'} to {outputs}, "
+            f"{len(self.states)} states, Ts = {self.sampling_time:g} s)"
+        )
+
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks that a step evaluates."""

@@ -56,7 +56,7 @@ STD_KINDS = {
         "robust (batch means), because White's test finds errors of the free run of varying size "
         "(by chance in 3 %)"
     ),
-    "none": "none: the errors of the free run are correlated over too many steps",
+    "none": "none: the errors are correlated over too many steps",
     "chosen": "none: the terms were chosen on the rows that were fitted",
 }
 """How standard errors were made, in words."""

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.lines import BIASED_INTERVAL, estimate_rows
 from orthaug.analysis.fit_findings import Findings
 from orthaug.data.record import Record
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimates import STD_KINDS, Estimate
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
@@ -172,6 +172,7 @@ def _fit_card(fit: Estimate) -> Card:
         "status": f"{status.code}, {status.iterations} iterations, {status.seconds:.2f} s, loss "
         f"{status.loss:.6g}",
         "": status.message or "",
+        "std": "" if fit.plain_covariance is None else STD_KINDS[fit.std_kind],
     }
     found = fit.parameters.to_dict("index")
     cells = estimate_rows(

@@ -95,6 +95,10 @@ class Selection:
     level: float = LEVEL
     """The rate of false discoveries that was allowed."""
 
+    def __repr__(self) -> str:
+        learner = "" if self.learner is None else f", {self.learner!r}"
+        return f"Selection({self.lags!r}{learner}; print `summary()`)"
+
     @property
     def lags(self) -> Lags:
         """Chosen orders, and lags of inputs that have only a nonlinear effect."""
