@@ -19,6 +19,7 @@ from orthaug.analysis.fit_findings import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_SMALL = 1e-4  # below it a power of ten is written, as `g` does
 _ROUNDING = 1e-12  # of its scale: a smaller number is the rounding error of zero
 _MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number of its own
 
@@ -51,12 +52,16 @@ def interval(ends: Sequence[float | None] | None, digits: int = 5) -> str:
     decimals = None if not scale else digits - 1 - math.floor(math.log10(scale))
     if decimals is None or not 0 < decimals <= MOST_DIGITS or None in ends:
         return " … ".join(number(end, digits, scale) for end in ends)
+    power = math.floor(math.log10(scale)) if scale and scale < _SMALL else 0
+    rounding = _ROUNDING * (scale or 0.0)
     texts = [
-        f"{0.0 if abs(end) <= _ROUNDING * (scale or 0.0) else end:.{decimals}f}" for end in known
+        f"{0.0 if abs(end) <= rounding else end / 10.0**power:.{decimals + power}f}"
+        for end in known
     ]
     while all(text.endswith("0") for text in texts) and "." in texts[0]:
         texts = [text[:-1].removesuffix(".") for text in texts]
-    return " … ".join(texts).replace("-", "−")
+    shown = " … ".join(texts).replace("-", "−")
+    return f"({shown})·10{str(power).translate(_RAISED)}" if power else shown
 
 
 def percent(share: float | None, digits: int = 2, *, signed: bool = False) -> str:
