@@ -185,7 +185,7 @@ def try_file(kind: str, seed: int, original: bytes, folder: Path) -> str:
     path.write_bytes(mutated_member(original, rng) if inner else mutated(original, rng))
 
     def judge() -> str:
-        record = read_record(path, inputs=["u"], outputs=["y"])
+        record = read_record(path, inputs=["u"], outputs=["y"], sampling_time=1.0)
         found = {"u": record.experiments[0].inputs[:, 0], "y": record.experiments[0].outputs[:, 0]}
         try:
             expected = plain(path)

@@ -350,7 +350,7 @@ def test_a_much_lower_error_without_sure_gain_says_why():
     record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
     rows = ValidationRows(record, record, None, "rows held out", "")
     advice, trials = _conclude_trials(
-        base, [ProposalErrors(Proposal("a term", {}), tried)], rows, 0, False
+        base, [ProposalErrors(Proposal("a term", {}), tried)], rows, 0, False, slow=False
     )
     assert not advice, advice
     assert "lower, but not surely on other rows" in trials.text
