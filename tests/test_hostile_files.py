@@ -89,7 +89,7 @@ def test_long_doubles_beyond_double_precision_are_not_finite_and_warn_of_nothing
         pytest.raises(InputError, match="row 1, column 'u': found 'inf'"),
     ):
         warnings.simplefilter("error")
-        read_record(tmp_path / "run.npz", inputs=["u"])
+        read_record(tmp_path / "run.npz", inputs=["u"], sampling_time=1.0)
 
 
 def test_parquet_with_the_channel_as_index(tmp_path):
