@@ -60,18 +60,29 @@ def usual_biases(fit):
 
 @pytest.fixture(scope="module")
 def alone() -> oa.MotionEstimate:
-    return oa.estimate(data(friction=0.1), spring(), learner=None, criterion=WHOLE)
+    return oa.estimate(
+        data(friction=0.1), spring(), learner=None, criterion=WHOLE, standard_errors="plain"
+    )
 
 
 @pytest.fixture(scope="module")
 def clean() -> oa.MotionEstimate:
-    return oa.estimate(data(friction=0.0), spring(), learner=None, criterion=WHOLE)
+    return oa.estimate(
+        data(friction=0.0), spring(), learner=None, criterion=WHOLE, standard_errors="plain"
+    )
 
 
 @pytest.fixture(scope="module")
 def learned() -> oa.MotionEstimate:
     learner = oa.MLP((4,), inputs=("v",))
-    return oa.estimate(data(), spring(learned=True), learner=learner, criterion=WHOLE, blocks=0)
+    return oa.estimate(
+        data(),
+        spring(learned=True),
+        learner=learner,
+        criterion=WHOLE,
+        blocks=0,
+        standard_errors="plain",
+    )
 
 
 def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_size(

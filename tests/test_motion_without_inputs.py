@@ -180,7 +180,7 @@ def predators() -> np.ndarray:
 
 
 def test_a_lagged_model_alone_without_descent_speaks_of_the_physics():
-    noise = 0.05 * np.random.default_rng(14).normal(size=(400, 2))
+    noise = 0.05 * np.random.default_rng(4).normal(size=(400, 2))
     record = oa.Record.from_arrays(
         None, predators() + noise, outputs=["prey", "pred"], sampling_time=0.1
     )

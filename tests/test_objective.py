@@ -133,7 +133,7 @@ def test_states_follow_only_where_that_lowers_the_misfit():
     linear = given.linearise(point)
     again = given.evaluate(p, linear.start)
     assert again.misfit < point.misfit and not np.array_equal(again.states, point.states)
-    worse = linear.start._replace(offset=1e3 * linear.start.offset)
+    worse = linear.start._replace(offset=-1e3 * linear.start.offset)
     np.testing.assert_array_equal(given.evaluate(p, worse).states, point.states)
 
 

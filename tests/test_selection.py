@@ -330,7 +330,9 @@ def test_no_term_within_the_span_of_the_physics_is_taken():
 def test_parameters_that_the_terms_move_are_shown_before_and_after():
     one = oa.select(exchanger(1), HEAT, criterion=oa.Prediction(), most=4, halves=False)
     alone = oa.estimate(exchanger(1), HEAT, criterion=oa.Prediction(), blocks=0).parameters
-    fitted = oa.estimate(exchanger(1), HEAT, blocks=0, **one.options).parameters
+    fitted = oa.estimate(
+        exchanger(1), HEAT, blocks=0, standard_errors="plain", **one.options
+    ).parameters
     for shift in one.physics.shifts:
         assert shift.before == pytest.approx(alone["value"][shift.parameter], rel=0.02)
         assert shift.after == pytest.approx(fitted["value"][shift.parameter], rel=0.02)

@@ -79,13 +79,14 @@ def steps_between(instants: Vector) -> tuple[float, Vector]:
     return float(steps.mean()), np.append(steps, steps[-1])
 
 
-def _other_name(name: str) -> str:
+def _other_name(name: Any) -> str:
     """Return what to call the channel of a column with such a name, as a sentence; or nothing."""
-    words = "_".join(re.findall(r"[A-Za-z0-9]+", str(name)))[:LONGEST]
+    words = "_".join(re.findall(r"[A-Za-z0-9]+", name if isinstance(name, str) else ""))
+    words = words[:LONGEST]
     other = words if is_name(words) else f"the_{words}"[:LONGEST]
     if not words or not is_name(other):
         return ""
-    column = visible(str(name))
+    column = visible(name)
     return f' Call it {other}, and give the name in the file as its column: column = "{column}".'
 
 
