@@ -243,6 +243,7 @@ FLIGHT = {
     "blocks": 0,
     "fallback": False,
     "solver": oa.LevenbergMarquardt(),
+    "standard_errors": "plain",
 }
 
 

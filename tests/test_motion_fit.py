@@ -392,7 +392,7 @@ def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
     assert found is not None and found.verdict == "white" and "noise on the outputs" in found.text
     assert robust_free_run(fitted) is fitted
     assert found.missing is not None and not found.missing.found(0.01, 0.05)
-    alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE)
+    alone = oa.estimate(data(), spring(), learner=None, criterion=WHOLE, standard_errors="plain")
     found = oa.diagnose(alone, free_run=alone.model.simulate(data()))
     assert (
         found is not None and found.verdict == "unmodelled" and found.predictable[0].own_past > 0.5
