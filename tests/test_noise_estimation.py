@@ -435,7 +435,7 @@ def test_intervals_hold_with_the_noise_model_and_not_without() -> None:
         off.append(apart / np.asarray(fit.std))
         low, high = np.asarray(fit.interval).T
         held.append((low <= fit.theta - apart) & (fit.theta - apart <= high))
-        white = oa.estimate(own, PHYSICS, learner=None)
+        white = oa.estimate(own, PHYSICS, learner=None, standard_errors="plain")
         plain.append((white.theta - [1.5, -0.7, 1.0, 0.5]) / np.asarray(white.std))
     assert 0.93 <= np.mean(held) <= 0.97
     assert np.abs(np.mean(off, axis=0)).max() < 0.25  # 1/√200 is 0.07
