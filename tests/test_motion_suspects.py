@@ -312,7 +312,12 @@ def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
 
 def test_friction_that_turns_round_smoothly_is_no_drag() -> None:
     """6 tanh(v / 0.1) at speeds of 0.1: the jump explains less of what was learned than a drag of the wrong sign."""
-    options = {"learner": oa.MLP((4,), inputs=("v",)), "criterion": WHOLE, "blocks": 0}
+    options = {
+        "learner": oa.MLP((4,), inputs=("v",)),
+        "criterion": WHOLE,
+        "blocks": 0,
+        "standard_errors": "plain",
+    }
     fit = oa.estimate(data(friction=6.0, noise=0.0005), spring(learned=True), **options)
     kinds = ("coulomb", "quadratic_drag", "cubic")
     suspects = [oa.MotionSuspect.of(kind, "v", factor="-1/m", name=kind) for kind in kinds]

@@ -244,7 +244,7 @@ def test_intervals_over_experiments_hold(record_property: Any) -> None:
     truth = oa.estimate(record_of(0, 400, 300), PHYSICS, learner=None).theta
     held, conditional = np.zeros(2), np.zeros(2)
     for seed in range(100):
-        fit = oa.estimate(record_of(1000 + seed, 8), PHYSICS, learner=None)
+        fit = oa.estimate(record_of(1000 + seed, 8), PHYSICS, learner=None, standard_errors="plain")
         low, high = over(fit).interval.T
         held += (low <= truth) & (truth <= high)
         low, high = np.asarray(fit.interval).T
