@@ -588,12 +588,16 @@ def _drop_same(causes: Causes, others: Sequence[SuspectedBias]) -> list[Suspecte
     found: list[SuspectedBias] = []
     for one in others:
         known = (*causes.entries, *found)
-        if not any(
-            one.equation == other.equation and abs(one.share - other.share) < _SAME * other.share
-            for other in known
-        ):
+        if not any(_is_same(one, other) for other in known):
             found.append(one)
     return found
+
+
+def _is_same(one: SuspectedBias, other: SuspectedBias) -> bool:
+    """Return whether two terms of an equation explain as much, and overlap the physics as much."""
+    if one.equation != other.equation or abs(one.share - other.share) >= _SAME * other.share:
+        return False
+    return abs((one.cosine or 0.0) - (other.cosine or 0.0)) < _SAME
 
 
 def _as_physics(causes: Causes) -> tuple[str, ...]:
