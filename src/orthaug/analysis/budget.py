@@ -56,6 +56,7 @@ from orthaug.physics.parameters import PhysicsMap
 
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _ALIKE = 1e-6  # of a bias
+_ALIKE_SHIFT = 0.05  # of it: terms that move the parameters alike
 _SAME = 1e-3  # of a share: terms that differ less are one term by two names
 _WHOLE = 0.95  # of what the learner found: a cause that may stand in its place
 _LISTED = 4  # parameters that a warning lists at most
@@ -594,10 +595,11 @@ def _drop_same(causes: Causes, others: Sequence[SuspectedBias]) -> list[Suspecte
 
 
 def _is_same(one: SuspectedBias, other: SuspectedBias) -> bool:
-    """Return whether two terms of an equation explain as much, and overlap the physics as much."""
+    """Return whether two terms of an equation explain as much, and move the parameters as much."""
     if one.equation != other.equation or abs(one.share - other.share) >= _SAME * other.share:
         return False
-    return abs((one.cosine or 0.0) - (other.cosine or 0.0)) < _SAME
+    apart = np.linalg.norm(one.shift - other.shift)
+    return bool(apart <= _ALIKE_SHIFT * np.linalg.norm(other.shift))
 
 
 def _as_physics(causes: Causes) -> tuple[str, ...]:
