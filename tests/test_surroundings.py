@@ -79,6 +79,25 @@ def test_what_cannot_be_done_is_one_line_and_exit_code_2(tmp_path, script, words
     assert not list(tmp_path.iterdir())
 
 
+def ended_by(number, program, folder):
+    """Send a signal to a program that has printed "ready"; its code, its errors, and how long it took, s."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        began = time.monotonic()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, err, time.monotonic() - began
+
+
 @pytest.mark.parametrize(
     ("number", "words"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")]
 )
@@ -92,22 +111,9 @@ def test_a_signal_while_a_folder_is_written(tmp_path, number, words):
         "'half').touch(); print('ready', flush=True)\n    while True:\n        try: "
         "time.sleep(100)\n        except BaseException: pass\n"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-        began = time.monotonic()
-        process.send_signal(number)
-        _, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
-    assert time.monotonic() - began < 5
-    assert (process.returncode, err) == (128 + number, f"{words}; nothing is written\n")
+    code, err, seconds = ended_by(number, program, tmp_path)
+    assert seconds < 5
+    assert (code, err) == (128 + number, f"{words}; nothing is written\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -119,20 +125,8 @@ def test_a_signal_during_the_trials_leaves_the_finished_fit(tmp_path):
         "advice.advise = wait\nsys.argv = ['orthaug', 'fit', 'plant.toml', '--out', 'out']\n"
         "from orthaug.commands.entry import main\nmain()\n"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
-        process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 128 + signal.SIGTERM and "; out is written" in err
+    code, err, _ = ended_by(signal.SIGTERM, program, tmp_path)
+    assert code == 128 + signal.SIGTERM and "; out is written" in err
     result = json.loads((tmp_path / "out" / "result.json").read_text(encoding="utf-8"))
     assert result["parameters"] and result["advice"] == [] and result["advice_trials"] is None
     assert (tmp_path / "out" / "model").is_dir() and (tmp_path / "out" / "report.html").is_file()

@@ -14,9 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-MAKERS: dict[
-    str, Callable[..., Any]
-] = {}  # html, plot, report, progress, diagnose, findings, intervals
+MAKERS: dict[str, Callable[..., Any]] = {}
+"""What packages above make: html, plot, report, progress, diagnose, findings, intervals."""
 
 
 class NotebookView:

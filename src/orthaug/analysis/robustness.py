@@ -45,25 +45,29 @@ def with_suited_errors(fit: Any, *, ordered: bool = True) -> Any:
     Args:
         ordered: whether the order of the rows means something, so that errors have a colour.
     """
-    if isinstance(fit.problem, StreamedProblem) or not fit.status.ok:
+    if isinstance(fit.problem, StreamedProblem) or not fit.status.ok or not fit.robust_kinds:
         return fit
+    return attempt("the robust covariance", lambda: _suited(fit, ordered=ordered), [], fit)
 
-    ahead = fit.criterion.free_run is None or fit.model.coloured
-    run = fit.model.predict if ahead else fit.model.simulate
 
-    def suited() -> Any:
-        response = run(fit.problem.record)
-        found = robust_where_asked(fit, response, ordered=ordered)
-        if (
-            not ordered
-            or found.std is None
-            or found.std_kind != "plain"
-            or _memory(fit, response) is None
-        ):
-            return found
-        return replace(found, warnings=(*found.warnings, Warning("coloured_residual", _ROUGH)))
-
-    return attempt("the robust covariance", suited, [], fit)
+def _suited(fit: Any, *, ordered: bool) -> Any:
+    """Return `with_suited_errors`; plain errors of coloured ones come with a warning."""
+    record, simulates = fit.problem.record, fit.criterion.free_run is not None
+    response = None if simulates else fit.model.predict(record)
+    found = (
+        robust_free_run(fit)
+        if response is None
+        else robust_where_asked(fit, response, ordered=ordered)
+    )
+    if not ordered or found.std is None or found.std_kind != "plain":
+        return found
+    if response is None and fit.scores is not None:
+        coloured = _is_tested(fit) and _coloured_run(fit)
+    else:
+        coloured = _memory(fit, response or fit.model.simulate(record)) is not None
+    if not coloured:
+        return found
+    return replace(found, warnings=(*found.warnings, Warning("coloured_residual", _ROUGH)))
 
 
 def robust_where_asked(fit: Estimate, response: Response, *, ordered: bool = True) -> Estimate:

@@ -110,8 +110,8 @@ def sensitivities(
             else None
             for i in equations
         ]
-        steps = form.sampling_time if segmented.record.even else form.durations(u)
-        halves = np.broadcast_to(np.asarray(steps) / 2, u.shape[:2])
+        pace = 1.0 if segmented.record.even else form.split_pace(u)[1]
+        halves = np.broadcast_to(form.sampling_time / 2 * pace, u.shape[:2])
         columns = _propagate(to_next, to_output, added, at_ends, equations, acting, halves, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():

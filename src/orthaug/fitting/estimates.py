@@ -236,13 +236,8 @@ class Estimate(FitView):
         """
         kinds = self.robust_kinds
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")
+        self._check_not_withheld()
         statistics = self._white_statistics
-        if self.std_kind == "none":
-            raise InputError(
-                "no kind of standard errors holds for this fit: its errors are correlated over too "
-                "much of the record, as its warning says. Use a longer record, or physics with "
-                "smaller errors."
-            )
         if (
             self.scores is None
             or self.covariance is None
@@ -257,6 +252,15 @@ class Estimate(FitView):
         modelled = kind == "autoregressive"
         own = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
         return replace(self._with_statistics(own, kind), freedom=own.freedom)._renewed()
+
+    def _check_not_withheld(self) -> None:
+        """Raise InputError where the errors allow no standard errors of any kind."""
+        if self.std_kind == "none":
+            raise InputError(
+                "no kind of standard errors holds for this fit: its errors are correlated over too "
+                "much of the record, as its warning says. Use a longer record, or physics with "
+                "smaller errors."
+            )
 
     def _with_statistics(self: Fit, statistics: Statistics, kind: str) -> Fit:
         """Return the fit with statistics for robust errors, beside those for white noise."""

@@ -170,14 +170,13 @@ class LaggedEstimate(Estimate):
                 "white innovations."
             )
         simulates = self.criterion.free_run is not None
-        if self.std_kind != "none" and (
-            self.covariance is None or self.at_bound or (simulates and self.scores is None)
-        ):
+        self._check_not_withheld()
+        if self.covariance is None or self.at_bound or (simulates and self.scores is None):
             raise InputError(
                 "robust standard errors need a fit with standard errors and no parameter at a "
                 "bound."
             )
-        if simulates or self.std_kind == "none":
+        if simulates:
             return super().robust(lags, kind)
         kinds = self.robust_kinds
         kind = kinds[0] if kind is None else check_choice(kind, kinds, "`kind`")

@@ -21,13 +21,8 @@ from orthaug.fitting.segments import Segments, packed, respond, sensitivity
 from orthaug.models.dynamics import Dynamics, Numbers
 
 RUNAWAY = 1e6  # mean square in deviations of the output: a free run beyond it has diverged
-_SHARES = (
-    0.25,
-    0.06,
-    0.015,
-    0.004,
-    0.001,
-)  # of the way to the best states, where that leads too far
+# Of the way to the best states, where all of it leads too far
+_SHARES = (0.25, 0.06, 0.015, 0.004, 0.001)
 _LARGEST_ERROR = 1e120
 
 

@@ -61,13 +61,9 @@ class MotionField:
         """Return the record's inputs (…, external) at the sample, of the rows that steps read."""
         return inputs[..., : len(self.motion.external)]
 
-    def split_pace(self, row: Array) -> tuple[Any, Any]:
+    def split_pace(self, row: AnyArray) -> tuple[Any, Any]:
         """Return what a step reads of the inputs, and its length over the sampling time."""
         return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
-
-    def durations(self, rows: Any) -> Any:
-        """Return the seconds (…,) that each step takes, of rows (…, r) that carry its pace."""
-        return np.broadcast_to(self.sampling_time * self.split_pace(rows)[1], rows.shape[:-1])
 
     def external(self, u: Any) -> Any:
         """Return the record's inputs (external,) of all inputs u (nu,) at a point."""
