@@ -168,8 +168,8 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
     """Return the share of a signal (N,) that any smooth function of the rows x could explain.
 
     Where two rows lie close to each other, their values differ by the rest alone: half the mean
-    square of that is the variance of the rest (Rice 1984). Where they lie far apart, as in many
-    dimensions, it explains less than there is.
+    square of that is the variance of the rest (Rice 1984), to be compared with the mean square of
+    both. Where they lie far apart, as in many dimensions, it explains less than there is.
     """
     from scipy.spatial import KDTree
 
@@ -181,8 +181,11 @@ def from_neighbours(x: Matrix, signal: Vector) -> Share:
     nearest = near[
         np.arange(len(x)), np.argmax(np.abs(near - np.arange(len(x))[:, None]) > _APART, axis=1)
     ]
-    e = signal - signal.mean()
-    both = np.stack([e**2, (e - e[nearest]) ** 2 / 2])
+    # Two rows that are each other's nearest are one pair, not two that agree by chance
+    pairs = np.unique(np.sort(np.column_stack([np.arange(len(x)), nearest]), axis=1), axis=0)
+    a, b = (signal - signal.mean())[pairs].T
+    # Of both neighbours' squares: of one's alone, errors of uneven size would seem to differ less
+    both = np.stack([(a**2 + b**2) / 2, (a - b) ** 2 / 2])
     return Share.of(
         *np.stack([part.sum(axis=1) for part in np.array_split(both, BLOCKS, axis=1)], axis=1)
     )
