@@ -147,10 +147,7 @@ def test_coloured_errors_have_robust_intervals_by_default(segment):
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     np.testing.assert_array_equal(fit.theta, plain.theta)
     assert (fit.std > 1.2 * plain.std).any() and 19 <= fit.freedom < 100
-    assert (
-        "std         robust (batch means), because the errors of the free run are coloured"
-        in fit.summary()
-    )
+    assert "std         robust (batch means), for coloured errors of the free run" in fit.summary()
     assert default(fit).freedom == fit.freedom  # robust errors of robust errors are the same
     np.testing.assert_array_equal(fit.robust(90).plain_covariance, plain.covariance)
 

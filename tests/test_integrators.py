@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -161,3 +162,89 @@ def test_an_unknown_one_is_refused_with_those_that_are_known(folder):
     done = run("check", "spec.toml")
     assert done.code == 2
     assert all(name in done.err for name in ("motion.integrator", "rk4", "exact", "discrete"))
+
+
+MOTOR = """
+[data]
+sampling_time = 0.005
+inputs = ["voltage"]
+outputs = ["speed"]
+train = {{ files = ["motor.csv"] }}
+[motion]
+{chosen}
+[motion.states]
+current = {{ derivative = "(voltage - R*current - K*speed)/0.0006", start = 0 }}
+speed = {{ derivative = "(K*current - b*speed - {friction})/0.0002", start = "speed" }}
+[motion.outputs]
+speed = "speed"
+[motion.parameters]
+R = {{ initial = 1.0, min = 0 }}
+K = {{ initial = 0.04, min = 0 }}
+b = {{ initial = 2e-4, min = 0 }}
+[training]
+segment = 0
+[validation]
+blocks = 0
+"""
+
+
+@pytest.fixture
+def motor(tmp_path, monkeypatch):
+    """A motor whose current settles in half a millisecond, sampled every five."""
+    from scipy.linalg import expm
+
+    rng = np.random.default_rng(3)
+    voltage = np.repeat(rng.uniform(-12, 12, 60), 10)
+    rates = np.array(
+        [[-1.2 / 6e-4, -0.05 / 6e-4, 1 / 6e-4], [0.05 / 2e-4, -1e-4 / 2e-4, 0], [0] * 3]
+    )
+    step, state, speeds = expm(0.005 * rates), np.zeros(3), []
+    for state[2] in voltage:
+        speeds.append(state[1])
+        state = step @ state
+    noisy = np.array(speeds) + 0.2 * rng.standard_normal(len(speeds))
+    pd.DataFrame({"voltage": voltage, "speed": noisy}).to_csv(tmp_path / "motor.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+
+    def write(chosen="", friction="0"):
+        (tmp_path / "spec.toml").write_text(MOTOR.format(chosen=chosen, friction=friction))
+        return tmp_path / "spec.toml"
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("chosen", "friction", "expected"),
+    [
+        ("", "0", "exact"),
+        ('integrator = "rk4"', "0", "rk4"),
+        ("substeps = 64", "0", "rk4"),
+        ("", "0.5*tanh(speed)", "rk4"),  # at most speeds the stiff part is not that at the origin
+    ],
+)
+def test_a_linear_part_that_is_stiff_goes_by_its_exponential(motor, chosen, friction, expected):
+    """The integrator that the data choose; 24 substeps of Runge-Kutta where that is declared."""
+    problem = oa.load_spec(motor(chosen, friction)).problem
+    assert problem.motion.integrator == expected
+    if not friction.startswith("0.5") and "64" not in chosen:
+        assert problem.substeps == (1 if expected == "exact" else 24)
+
+
+def test_a_stiff_motor_is_fitted_and_the_remedy_of_many_substeps_is_right(motor):
+    done = run("fit", str(motor()), "--out", "exact")
+    assert done.code == 0, done.err
+    result = finite_json((Path("exact") / "result.json").read_text())
+    assert result["motion"]["integrator"] == "exact"
+    for one, truth in zip(result["parameters"], (1.2, 0.05, 1e-4), strict=True):
+        low, high = one["ci95"]
+        assert low < truth < high and high - low < 1.5 * truth, one
+    text = '`integrator = "exact"` needs far fewer.'
+    assert text in warning_of("stiff", run("check", str(motor('integrator = "rk4"')), "--json"))
+    assert "equilibrium" in warning_of(
+        "stiff", run("check", str(motor(friction="0.5*tanh(speed)")), "--json")
+    )
+
+
+def warning_of(code, done):
+    assert done.code == 0, done.err
+    return next(one["text"] for one in json.loads(done.out)["warnings"] if one["code"] == code)

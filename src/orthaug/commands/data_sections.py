@@ -233,7 +233,7 @@ class MotionSection(KindSection):
     by_evidence: ClassVar[bool] = True
     takes_uneven_rows: ClassVar[bool] = True
     foreign_keys: ClassVar[Mapping[str, str]] = {"output": "beside [motion]; expected `equation`"}
-    integrator: str = "rk4"
+    integrator: str = "auto"
     substeps: Literal["auto"] | Annotated[int, Field(ge=1, le=MOST_SUBSTEPS, strict=True)] = "auto"
     hold: Literal[HOLDS] = "zero-order"  # type: ignore[valid-type]
     states: Annotated[dict[str, StateSection], Field(min_length=1)] = {}

@@ -417,9 +417,16 @@ def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warnin
         )
     ]
     if trial.substeps >= _STIFF:
+        undeclared = replace(motion, integrator="auto", substeps=None)
+        remedy = (
+            '`integrator = "exact"` needs far fewer.'
+            if replace(problem, motion=undeclared).integrator == "exact" != motion.integrator
+            else "Where its fastest state settles within a sample, write that state's equilibrium "
+            "into the other equations instead."
+        )
         text = (
-            f"the motion is stiff for its sampling: {trial.substeps} substeps; "
-            '`integrator = "exact"` may need fewer.'
+            f"the motion is stiff for its sampling: {trial.substeps} substeps in a sample make "
+            f"every run slow. {remedy}"
         )
         warnings.append(Warning("stiff", text))
     if len(trial.holds) > 1:

@@ -46,16 +46,11 @@ if TYPE_CHECKING:
 
 STD_KINDS = {
     "plain": "for white errors of constant variance",
-    "hc3": "robust (HC3), because White's test finds errors of varying size (by chance in 3 %)",
-    "newey-west": "robust (Newey-West), because the one-step residual is coloured",
-    "batch-means": "robust (batch means), because the errors of the free run are coloured",
-    "autoregressive": (
-        "robust (autoregressive errors), because the errors of the free run are coloured"
-    ),
-    "batch-means-uneven": (
-        "robust (batch means), because White's test finds errors of the free run of varying size "
-        "(by chance in 3 %)"
-    ),
+    "hc3": "robust (HC3), for errors of varying size",
+    "newey-west": "robust (Newey-West), for coloured errors one step ahead",
+    "batch-means": "robust (batch means), for coloured errors of the free run",
+    "autoregressive": "robust (autoregressive errors), for coloured errors of the free run",
+    "batch-means-uneven": "robust (batch means), for errors of the free run of varying size",
     "none": "none: the errors are correlated over too many steps",
     "chosen": "none: the terms were chosen on the rows that were fitted",
 }

@@ -8,7 +8,7 @@ Training and simulation go on from there: a start is an unknown.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -31,6 +31,8 @@ _GROWS = 10.0  # by a factor of e^10 over the record, a mode grows
 # Growth of an error over the record, and over a segment, as logarithms, and steps of a segment
 _LEAVES, _FOLLOWED, _SHORTEST = (12.0, 3.0, 8)
 _STEP = 1e-6  # relative, of differences
+# Substeps of Runge-Kutta from which, and by how many times fewer of which, `exact` is chosen
+_STIFF, _FEWER = (8, 4)
 _ROWS, _DEGREE = 9, 2  # of a local polynomial
 
 
@@ -105,8 +107,12 @@ class GuessedMotion:
 
     def _modes_at(self, values: Vector) -> Complex[np.ndarray, "m nx"]:
         """Return `modes` at some values of the parameters."""
-        x, u = self.guessed_points
-        size = np.maximum(np.abs(x).max(axis=1), 1e-6 * np.abs(x).max(initial=1e-6))
+        return np.linalg.eigvals(self._slopes(values, *self.guessed_points)).astype(complex)
+
+    def _slopes(self, values: Vector, x: Any, u: Any) -> Float[np.ndarray, "m nx nx"]:
+        """Return ∂f/∂x at states x (nx, k) and inputs u (nu, k), where it is finite."""
+        size = np.abs(self.guessed_points[0]).max(axis=1)
+        size = np.maximum(size, 1e-6 * size.max(initial=1e-6))
         columns = []
         with np.errstate(all="ignore"):
             for i, h in enumerate(_STEP * size):
@@ -117,13 +123,61 @@ class GuessedMotion:
                 )
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
-        slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
-        return np.linalg.eigvals(slopes).astype(complex)
+        return slopes[np.isfinite(slopes).all(axis=(1, 2))]
 
     @property
     def fastest(self) -> float:
         """Largest |eigenvalue| of ∂f/∂x [1/s] at the initial parameters and guessed states."""
         return float(np.abs(self.modes).max(initial=0.0))
+
+    @property
+    def integrator(self) -> str:
+        """The declared integrator; where that is "auto", the one for this record.
+
+        That is Runge-Kutta, but "exact" where its linear part makes the motion stiff for the
+        sampling: the rest, which goes by explicit stages, needs far fewer substeps. A sampling
+        time too long for Runge-Kutta altogether may be a wrong unit, and is refused.
+        """
+        motion = self.motion
+        if motion.integrator != "auto":
+            return motion.integrator
+        if motion.substeps is not None or motion.functions is not None or not self.record.even:
+            return "rk4"
+        x, u = self.guessed_points
+        linear = self._slopes(motion.initial, np.zeros((len(x), 1)), np.zeros((len(u), 1)))
+        whole, needed = self._slopes(motion.initial, x, u), motion.scheme.first_substeps
+        if not len(linear) or not len(whole) or not _STIFF <= self.substeps <= MOST_SUBSTEPS:
+            return "rk4"
+        rest = np.linalg.eigvals(whole - linear)
+        few = needed(float(np.abs(rest).max(initial=0.0)) * self.record.longest_step)
+        exact = replace(self, motion=replace(motion, integrator="exact"))
+        reachable = not exact.exponential_fault()
+        return "exact" if reachable and _FEWER * few <= self.substeps else "rk4"
+
+    def exponential_fault(self) -> str:
+        """Return why `exact` cannot be used; empty where it can.
+
+        Modes that samples do not show, or whose exponential has no digits.
+        """
+        sampling_time, modes = self.record.sampling_time, self.modes
+        lasting = modes[modes.real * sampling_time > _GONE]
+        turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
+        fast = self.fastest * sampling_time / self.substeps
+        if turned > _TURNED:
+            return (
+                "at the initial parameters a mode of the motion oscillates with "
+                f"{turned / sampling_time:.3g} rad/s, {turned / (2 * np.pi):.3g} periods in a "
+                f"sample of {sampling_time:g} s: the data cannot determine it. Check units and "
+                "initial values, sample faster, or leave the fast mode out."
+            )
+        if fast > _FASTEST:
+            return (
+                f"the sampling time of {sampling_time:g} s is too long for the fastest mode of "
+                f'the motion, {self.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} '
+                f"in a substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), "
+                "check units and initial values, or leave the fast mode out."
+            )
+        return ""
 
     def _growth(self, modes: Any) -> Vector:
         """Return the growth [1/s] of the fastest growing mode, at every guessed state."""
@@ -184,31 +238,9 @@ def check_start(problem: GuessedMotion) -> None:
             f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
             '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
         )
-    if motion.scheme.splits_linear_part:
-        _check_exact(problem)
-
-
-def _check_exact(problem: GuessedMotion) -> None:
-    """Raise InputError for modes that samples do not show, or whose exponential has no digits."""
-    sampling_time = problem.record.sampling_time
-    modes: Any = problem.modes
-    lasting = modes[modes.real * sampling_time > _GONE]
-    turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
-    fast = problem.fastest * sampling_time / problem.substeps
-    if turned > _TURNED:
-        raise InputError(
-            "at the initial parameters a mode of the motion oscillates with "
-            f"{turned / sampling_time:.3g} rad/s, {turned / (2 * np.pi):.3g} periods in a "
-            f"sample of {sampling_time:g} s: the data cannot determine it. Check units and "
-            "initial values, sample faster, or leave the fast mode out."
-        )
-    if fast > _FASTEST:
-        raise InputError(
-            f"the sampling time of {sampling_time:g} s is too long for the fastest mode of the "
-            f'motion, {problem.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} in a '
-            f"substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), check units "
-            "and initial values, or leave the fast mode out."
-        )
+    fault = problem.exponential_fault() if motion.scheme.splits_linear_part else ""
+    if fault:
+        raise InputError(fault)
 
 
 def guess(

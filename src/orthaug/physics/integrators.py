@@ -166,6 +166,11 @@ class RungeKutta4(Integrator):
 
 
 @dataclass(frozen=True)
+class Automatic(RungeKutta4):
+    """Runge-Kutta, until a record is there to choose: see `GuessedMotion.integrator`."""
+
+
+@dataclass(frozen=True)
 class Exponential(Integrator):
     """Exponential time differencing of order 4 (Cox and Matthews 2002)."""
 
@@ -186,7 +191,7 @@ class Discrete(Integrator):
 
 INTEGRATORS = Registry(
     "integrator",
-    {"rk4": RungeKutta4, "exact": Exponential, "discrete": Discrete},
+    {"auto": Automatic, "rk4": RungeKutta4, "exact": Exponential, "discrete": Discrete},
     group=plugins.INTEGRATORS,
     follows=Integrator,
 )

@@ -140,7 +140,7 @@ class Motion(NotebookView):
     constants: tuple[tuple[str, float], ...] = ()
     definitions: tuple[tuple[str, Expression], ...] = ()
     """Names for longer expressions, each after those that it uses."""
-    integrator: str = "rk4"
+    integrator: str = "auto"
     # Not compared: a compiled program has the number that was chosen, declared or not
     substeps: int | None = field(default=None, compare=False)
     """Steps of the integrator in a sample; None to choose them by the data."""
@@ -175,7 +175,7 @@ class Motion(NotebookView):
         *,
         constants: Mapping[str, float] | None = None,
         define: Mapping[str, str] | None = None,
-        integrator: str = "rk4",
+        integrator: str = "auto",
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:
@@ -187,7 +187,8 @@ class Motion(NotebookView):
             inputs: names of the input channels, in the record's order.
             define: names for longer expressions.
             integrator: "rk4" (Runge-Kutta of order 4), "exact" (the linear part by matrix
-                exponential), "discrete", or another of `INTEGRATORS`.
+                exponential), "auto" ("exact" where "rk4" needs many more substeps), "discrete", or
+                another of `INTEGRATORS`.
             substeps: steps of the integrator in a sample, 1 to 256; None to choose them by the
                 data.
             hold: inputs between samples: "zero-order" (a value is held), "first-order" (straight)
@@ -248,7 +249,7 @@ class Motion(NotebookView):
         parameters: Sequence[PhysicalParameter],
         inputs: Sequence[str] = (),
         *,
-        integrator: str = "rk4",
+        integrator: str = "auto",
         substeps: int | None = None,
         hold: str = "zero-order",
     ) -> Motion:

@@ -592,6 +592,7 @@ def pose_motion(
         deviation=deviation,
         weight=weigh_outputs(output_weights, deviation),
     )
+    problem = replace(problem, motion=replace(motion, integrator=problem.integrator))
     check_start(problem)
     return problem
 

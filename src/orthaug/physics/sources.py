@@ -41,7 +41,7 @@ class PhysicsSource:
         integrator, substeps, hold: of the motion; a spec has them in `[motion]`.
     """
 
-    integrator: str = field(default="rk4", metadata=LIBRARY_ONLY)
+    integrator: str = field(default="auto", metadata=LIBRARY_ONLY)
     substeps: int | None = field(default=None, metadata=LIBRARY_ONLY)
     hold: str = field(default="zero-order", metadata=LIBRARY_ONLY)
 
