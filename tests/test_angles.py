@@ -9,7 +9,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
-from orthaug.data.angles import find_wrap, wrap_warnings
+from orthaug.data.angles import find_resets, find_wrap, reset_warnings, wrap_warnings
 
 
 def turning(rows: int = 600) -> np.ndarray:
@@ -93,3 +93,51 @@ def test_init_unwraps_before_it_looks_for_orders(tmp_path):
     assert steps[0] == {"step": "unwrap", "period": 360.0, "channels": ["angle"]}
     fitted = oa.fit_spec(made).result
     assert fitted.scores["train"].simulation.nrmse[0] < 0.1
+
+
+def travelled(rows: int = 800, noise: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+    """A force and the way that a mass has gone, with noise."""
+    rng = np.random.default_rng(5)
+    force, way, speed = np.repeat(rng.uniform(0, 1, rows // 20), 20), np.zeros(rows), 0.0
+    for k in range(1, rows):
+        speed += 0.1 * (force[k - 1] - speed)
+        way[k] = way[k - 1] + speed
+    return force, way + noise * rng.normal(size=rows)
+
+
+def test_a_counter_that_is_reset_is_named_with_the_ranges_of_its_pieces():
+    force, way = travelled()
+    way[300:] -= way[300]
+    way[550:] -= way[550]
+    way[[40, 299, 411]] = np.nan
+    record = oa.Record.from_arrays(force, way, outputs=["way"], missing="keep")
+    (found,) = reset_warnings(record)
+    assert found.code == "reset_output"
+    assert "at 2 rows, the first behind row 298" in found.text
+    assert "`rows = [[0, 299], [299, 550], [550, 800]]`" in found.text
+    whole = oa.Record.from_arrays(*travelled(), outputs=["way"])
+    assert not reset_warnings(whole) and found in warnings_of(record)
+
+
+def warnings_of(record):
+    from orthaug.data.wild import data_warnings
+
+    return data_warnings(record)
+
+
+@pytest.mark.parametrize("case", ["answer", "spike", "noise", "switch", "heavy"])
+def test_other_jumps_are_no_resets(case):
+    force, way = travelled()
+    rng = np.random.default_rng(6)
+    if case == "answer":  # an impulse of the force throws the mass
+        force[400] += 300.0
+        way[401:] += 300.0
+    elif case == "spike":
+        way[400] += 300.0
+    elif case == "noise":
+        way = rng.normal(size=800)
+    elif case == "switch":
+        way = np.where(np.arange(800) // 50 % 2, 1.0, 0.0)
+    else:
+        way = way + 0.3 * rng.standard_t(2, size=800)
+    assert not find_resets(way, force[:, None])

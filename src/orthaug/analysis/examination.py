@@ -56,6 +56,7 @@ _FINDINGS = (
     "measure_detail",
 )
 _OF_UNSTABLE = ("free_run_diverges", "growing_mode")  # what `unstable_plant` says better
+_NO_NOISE = 0.9  # of an error that follows from its own past: the output moves by more than noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,10 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     if fit.status.ok and not one_step:
         run, estimated = responses[evidence.train.name][1], len(fit.problem.names)
         residuals = fields["residuals"]
-        driven = residuals is not None and residuals.verdict == "unmodelled"
+        driven = residuals is not None and (
+            residuals.verdict == "unmodelled"
+            or any(one.own_past > _NO_NOISE for one in residuals.predictable)
+        )
         judged = partial(explains_nothing, part=evidence.train, parameters=estimated, driven=driven)
         other = from_trained_start(fit, run) if judged(run) else None
         warnings += judged(run if other is None else other[0].response)

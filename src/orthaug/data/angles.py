@@ -1,4 +1,4 @@
-"""Outputs that are angles and wrap, such as from 180 to −180 degrees."""
+"""Outputs that jump: angles that wrap, as from 180 to −180 degrees, and counters that are reset."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import plural
 from orthaug.data.record import Record
@@ -18,6 +18,10 @@ _COVERED = 0.97  # of the period, which the samples cover
 _RARELY = 0.2  # of the steps are jumps, at most
 _SPIKE = 2  # rows, behind which a signal that jumped back was a wrong sample
 _BETWEEN = 0.05  # of the samples, at least, in the middle half: no signal that switches
+_APART = 20.0  # times the largest other step of a signal that is a jump
+_FEW = 0.005  # of the steps are such jumps, at most
+_BEFORE = 5  # rows before a jump, in which an input may cause it
+_STEPS = 1.5  # times the largest step of an input elsewhere that causes a jump
 
 
 @dataclass(frozen=True)
@@ -74,4 +78,61 @@ def wrap_warnings(record: Record) -> list[Warning]:
             f'`channels = ["{output.name}"]`.'
         )
         found.append(Warning("wrapped_angle", text))
+    return found
+
+
+def find_resets(samples: Vector, inputs: Matrix) -> list[int]:
+    """Return the rows behind which a signal goes on elsewhere, though no input causes it.
+
+    Few steps are many times larger than all others, the signal does not come back, and no input
+    (N, nu) has a step shortly before that is larger than all others.
+    """
+    there = np.flatnonzero(np.isfinite(samples))
+    if len(there) < 3:
+        return []
+    steps = np.abs(np.diff(samples[there]))
+    most = max(1, int(_FEW * len(steps)))
+    order = np.argsort(-steps)
+    sizes = steps[order[: most + 1]]
+    count = int(np.argmax(sizes[:-1] / np.maximum(sizes[1:], np.finfo(float).tiny))) + 1
+    if not sizes[count] > 0 or sizes[count - 1] < _APART * sizes[count]:
+        return []
+    rows = np.sort(order[:count])
+    if (np.diff(rows) <= _SPIKE).any():
+        return []  # wrong samples
+    moved, before = np.abs(np.diff(inputs, axis=0)), np.zeros(len(inputs) - 1, dtype=bool)
+    for row, end in zip(there[rows], there[rows + 1], strict=True):
+        before[max(row - _BEFORE, 0) : end] = True
+    causes = moved[before].max(axis=0, initial=0.0) > _STEPS * moved[~before].max(axis=0, initial=0)
+    if causes.any():
+        return []
+    return [int(row) for row in there[rows]]
+
+
+def reset_warnings(record: Record) -> list[Warning]:
+    """Return a warning of each output that goes on elsewhere within an experiment."""
+    found = []
+    for j, output in enumerate(record.outputs):
+        for experiment in record.experiments:
+            signal = experiment.outputs[:, j]
+            rows = [] if find_wrap(signal) else find_resets(signal, experiment.inputs)
+            if not rows:
+                continue
+            known = np.flatnonzero(np.isfinite(signal))
+            steps = np.abs(np.diff(signal[known]))
+            jumps = np.isin(known[:-1], rows)
+            edges = [0, *(row + 1 for row in rows), len(signal)]
+            first, stride = experiment.first_row, experiment.stride
+            ranges = ", ".join(
+                f"[{first + stride * a}, {first + stride * b}]"
+                for a, b in zip(edges[:-1], edges[1:], strict=True)
+            )
+            text = (
+                f"{output.name} jumps by {steps[jumps].max():.3g} at {plural(len(rows), 'row')}, "
+                f"the first behind {experiment.where(rows[0])}, and by "
+                f"{steps[~jumps].max():.3g} at most elsewhere, and no input moves more there than "
+                "elsewhere. A counter was reset, or the file holds several recordings. Make each "
+                f"piece an experiment of its own: `rows = [{ranges}]`."
+            )
+            found.append(Warning("reset_output", text))
     return found

@@ -16,7 +16,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
-from orthaug.data.angles import wrap_warnings
+from orthaug.data.angles import reset_warnings, wrap_warnings
 from orthaug.data.gaps import complete_record, filled_record, held_warnings, saturation_warnings
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
@@ -192,14 +192,14 @@ def data_warnings(
     effect: Callable[[tuple[WildSample, ...]], str] | None = None,
     limited: Sequence[str] = (),
 ) -> list[Warning]:
-    """Return warnings of wild samples, doubled rows, angles that wrap, and constant outputs.
+    """Return warnings of samples that are wrong: wild, doubled, frozen, wrapped or reset ones.
 
     Args:
         effect: says in a sentence what a fit without some samples gives.
         limited: names of outputs whose limits are known, as of what a controller sets.
     """
-    complete, record = complete_record(record), filled_record(record)
-    found, samples = [], wild_samples(record)
+    found, complete, record = reset_warnings(record), complete_record(record), filled_record(record)
+    samples = wild_samples(record)
     for name in dict.fromkeys(sample.name for sample in samples):
         own = tuple(sample for sample in samples if sample.name == name)
         found.append(
