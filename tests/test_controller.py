@@ -547,3 +547,17 @@ def test_lagged_physics_have_no_controller(folder: Path) -> None:
     answer = run("check", "spec.toml")
     assert answer.code == 2
     assert '`integrator` = "discrete"' in answer.err and "arma" in answer.err
+
+
+def test_a_wrong_gain_is_named_beside_the_friction_that_looks_like_it() -> None:
+    """The physics is right: the gain of the rate that is declared is a third too low."""
+    r = references(rows=800)
+    measured = naive_loop(r, 1e-3, friction=False)[:, :1]
+    plant = motion(learned=True)  # without a friction that could imitate the gain
+    fit = oa.estimate(record(measured, r), plant, learner=None, controller=pid(Kd=4.0))
+    text = fit.diagnose().residuals.text
+    assert "the equation of rate lacks something linear in rate" in text
+    assert (
+        "A wrong constant of the controller may look the same: compare its output with measured "
+        "torque." in text
+    )

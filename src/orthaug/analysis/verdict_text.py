@@ -11,7 +11,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import join_words, percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
 from orthaug.analysis.input_timing import LateInput
-from orthaug.analysis.missing_term import MissingTerm
+from orthaug.analysis.missing_term import SHAPES, MissingTerm
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.quantised_output import QuantisedOutput
@@ -466,7 +466,14 @@ def free_run_words(
             f"{late[0].input} acts {late[0].manner}: {late[0].gain}."
         )
     if lacks is not None:
-        return f"{subject} ({sizes}) contains more than noise. {_name_terms(lacks)}"
+        named = _name_terms(lacks)
+        held = fit.problem.motion.held
+        if held and not lacks.scattered and lacks.terms[0].shape == SHAPES[0]:
+            named += (
+                " A wrong constant of the controller may look the same: compare its output with "
+                f"measured {join_words(held)}."
+            )
+        return f"{subject} ({sizes}) contains more than noise. {named}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} varies with {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]

@@ -347,6 +347,8 @@ _UNTESTED = {
     "several_solutions": "other values of its parameters explain its data as well",
     "parameter_drift": "a parameter changes over its record",
     "differs_between_experiments": "its parameters differ between the experiments",
+    "reset_output": "an output goes on elsewhere within its record",
+    "wrapped_angle": "an angle wraps in its record",
     "held_output": "a sensor is slower than the rows of its data",
     "saturated_output": "an output is recorded at an end of its range",
     "wild_rows": "a few rows, which may be wrong, decide its parameters",
