@@ -215,7 +215,7 @@ REFUSED = [
     ),
     (
         {"y": STEPS, "outputs": ["position (mm)"]},
-        r"'position \(mm\)' cannot name a channel; use letters",
+        r"'position \(mm\)' cannot name a channel",
     ),
     ({"y": STEPS, "outputs": ["2nd"]}, "'2nd' cannot name a channel"),
     ({"y": STEPS, "outputs": [""]}, "'' cannot name a channel"),

@@ -110,9 +110,9 @@ class Channel:
     def __post_init__(self) -> None:
         if not is_name(self.name):
             raise InputError(
-                f"{_quote(self.name)} cannot name a channel; use letters, digits and "
-                f"underscores, at most {LONGEST}, not starting with a digit, and none of "
-                f"{', '.join(sorted(RESERVED))}.{_other_name(self.name)}"
+                f"{_quote(self.name)} cannot name a channel.{_other_name(self.name)} Use letters, "
+                f"digits and underscores, at most {LONGEST}, not starting with a digit, and none "
+                f"of {', '.join(sorted(RESERVED))}."
             )
         check_label(self.unit, f"the unit of '{self.name}'")
         check_type(self.column, str, f"column of '{self.name}'", "a column's name")

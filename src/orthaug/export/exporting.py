@@ -45,6 +45,7 @@ _TAKEN = (
 
 
 _ROWS, _SEED = 64, 0  # of the test vectors
+_INSIDE = 0.7  # of the half-width of a feature, at which a run of them begins
 _HELD = 8  # rows of each level: under a new one in every row an inertia hardly moves
 
 
@@ -240,16 +241,17 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
 
 
 def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
-    """Return initial states: in the middle of the learner's features, zero, one."""
-    zero = np.zeros(len(program.states))
-    entries = model.form.entries
-    centres = {
-        entry.text.partition("[")[0]: c
-        for entry, c in zip(entries, model.numbers.centre, strict=True)
-    }
-    yield np.array(
-        [float(centres.get(signal.name.partition("[")[0], 0.0)) for signal in program.states]
+    """Return initial states: within and in the middle of the learner's features, zero, one."""
+    zero, numbers = np.zeros(len(program.states)), model.numbers
+    names = [entry.text.partition("[")[0] for entry in model.form.entries]
+    own = [signal.name.partition("[")[0] for signal in program.states]
+    centres, widths = (
+        dict(zip(names, map(float, values), strict=True))
+        for values in (numbers.centre, numbers.halfwidth)
     )
+    middle, reach = (np.array([one.get(name, 0.0) for name in own]) for one in (centres, widths))
+    yield middle + _INSIDE * reach
+    yield middle
     yield zero
     yield zero + 1
 

@@ -532,6 +532,8 @@ def _best_window(model: Model[MotionDynamics], record: Record) -> int:
                 tried[-1] if len(longest) > 4 * tried[-1] else window :
             ]
             errors = errors[~np.isnan(errors).any(axis=1)] if not record.complete else errors
+            if not len(errors):  # no row is beyond the window
+                break
             square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
         if square < 0.98 * least:  # a longer one only where it is clearly better
             best, least = window, square

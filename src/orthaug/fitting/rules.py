@@ -161,8 +161,8 @@ def check_motion_choices(
     states, outputs = motion.learned
     if learns(learner) and not (states or outputs):
         raise KeyedError(
-            "there is a learner, but no state and no output of the motion is learned; set "
-            "`learned` where it is added.",
+            "there is a learner, but no state and no output of the motion is learned. Set "
+            "`learned` where it is added, or give `learner=None` for physics alone.",
             "learner",
             ": no state and no output has `learned = true`; expected one, or kind none",
         )

@@ -58,10 +58,13 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         or _code(result) == "hurts"
     )
     level = "bad" if bad else "care" if doubts or unstable else "good"
+    use = _use_text(result, level)
     opening = {
         "good": "The model is reliable",
         "care": "The model is usable with reservations",
-        "bad": "Do not use the model as it is",
+        "bad": "Do not use the model as it is"
+        if use.startswith(_SEARCH_ONLY)
+        else "Do not simulate with the model",
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
     if unstable:
@@ -73,9 +76,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     )
     causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
     first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
-    return PageVerdict(
-        level, f"{first}{opening}{shown}{because}.", _use_text(result, level), _next_step(result)
-    )
+    return PageVerdict(level, f"{first}{opening}{shown}{because}.", use, _next_step(result))
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
@@ -300,10 +301,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
-        yield (
-            f"its error on {worse[1]} is {times} times that on the training data, so the band "
-            "is too narrow"
-        )
+        yield f"its error on {worse[1]} is {times} times that on the training data"
     if result.validation is not None and result.validation.extrapolation:
         left = dict.fromkeys(entry.part for entry in result.validation.extrapolation)
         yield (
@@ -337,6 +335,7 @@ def _is_biased(row: ParameterResult) -> bool:
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
+_SEARCH_ONLY = "Use it only to search for missing physics"
 _UNTESTED = {
     "explains_nothing": "its free run explains nothing of an output",
     "quantised_output": "the steps of an output move its parameters",
@@ -368,12 +367,12 @@ def _use_text(result: FitResult, level: str) -> str:
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
-            "Use it only to search for missing physics: the RMS error of its one-step "
+            f"{_SEARCH_ONLY}: the RMS error of its one-step "
             f"prediction {_place_of(part)} is {percent(ahead)} of the output's standard deviation, "
             "too."
         )
     if level == "bad" and not (known and predicts):
-        return "Use it only to search for missing physics."
+        return f"{_SEARCH_ONLY}."
     if level == "bad" or _has_warning(result, _UNSTABLE):
         text = "predict the next sample"
     else:
