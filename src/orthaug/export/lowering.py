@@ -24,7 +24,6 @@ from orthaug.models.model import HoldsModel, Model, model_of
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
-from orthaug.physics.integrators import RungeKutta4
 from orthaug.physics.sources import FileSource
 
 
@@ -459,8 +458,8 @@ def _network(bound: Bound, numbers: Numbers, features: Sequence[Node], rows: Vec
 
 def _scheme(model: Model[MotionDynamics]) -> Scheme:
     form = model.form
-    runge_kutta = isinstance(form.motion.scheme, RungeKutta4)  # also of a motion without data
-    kind, substeps = "rk4" if runge_kutta else form.motion.integrator, form.substeps
+    kind, substeps = form.motion.integrator, form.substeps
+    kind = "rk4" if kind == "auto" else kind  # of a motion that no data chose for
     h = model.sampling_time / substeps
     if kind != "exact":
         return Scheme(kind, h, substeps)
