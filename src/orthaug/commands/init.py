@@ -368,8 +368,8 @@ def _thinning(roles: Roles, whole: FirstModel, model: FirstModel) -> list[str]:
         return [f"{slow} (decimate), with which free runs of the same time are clearly better"]
     errors = [percent(float(np.mean(one.free_run)), 3) for one in (model, whole)]
     return [
-        f"{slow} (decimate), with which the error of the free run on rows held out is {errors[0]} "
-        f"instead of {errors[1]}"
+        f"{slow} (decimate), with which the error of the free run on training rows held out is "
+        f"{errors[0]} instead of {errors[1]}"
     ]
 
 
