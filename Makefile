@@ -10,9 +10,6 @@ STAMP := .venv/ready
 LOG := .venv/setup.log
 PYTHONS ?= python3.13 python3.12 python3.11 python3
 
-# The tests start many processes; what these import is compiled once, whatever the setting outside is.
-export PYTHONDONTWRITEBYTECODE :=
-
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
 

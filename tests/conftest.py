@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import platform
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,6 +38,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NPROC", "1")
 # Where in the source each operation was written is not looked up for the compiler.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+# To rewrite the assertions of all tests is half of what collecting them takes: what comes of it is kept on disk,
+# whatever the setting outside is, and so is what the processes import that tests start.
+os.environ["PYTHONDONTWRITEBYTECODE"] = ""
+sys.dont_write_bytecode = False
+gc.disable()  # until all tests are collected: what is imported stays
 
 import jax  # noqa: E402  (it reads the settings above when it is imported)
 
@@ -84,6 +90,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """What was imported and collected stays: looking for garbage in it would take a twentieth of the time."""
     gc.freeze()
+    gc.enable()
     gc.set_threshold(100_000, 20, 100)
 
 

@@ -45,6 +45,12 @@ remedy; [What goes wrong](guide/trouble.md) has more on each warning.
 Text = tuple[str, str]  # the group of a text, and the text
 
 
+@cache
+def nodes_of(node: ast.AST) -> tuple[ast.AST, ...]:
+    """Return a node and all below it, looked for once: `ast.walk` would take most of the time."""
+    return tuple(ast.walk(node))
+
+
 def placeholder(node: ast.AST) -> str:
     """Return a readable name of the value that an f-string inserts, … where it has none."""
     match node:
@@ -108,7 +114,7 @@ def sentences_of(text: str) -> list[str]:
 
 def _help_of(tree: ast.AST) -> Iterator[ast.expr]:
     """Yield what `--help` prints: `help=` of options, and the docstrings of commands."""
-    for node in ast.walk(tree):
+    for node in nodes_of(tree):
         if isinstance(node, ast.keyword) and node.arg == "help":
             yield node.value
         elif isinstance(node, ast.FunctionDef):
@@ -122,8 +128,8 @@ def _help_of(tree: ast.AST) -> Iterator[ast.expr]:
 def _unread(tree: ast.AST) -> set[int]:
     """Return the nodes whose texts nobody reads: docstrings, annotations, keys, parts of others."""
     found: set[int] = set()
-    helped = {id(one) for part in _help_of(tree) for one in ast.walk(part)}
-    for node in ast.walk(tree):
+    helped = {id(one) for part in _help_of(tree) for one in nodes_of(part)}
+    for node in nodes_of(tree):
         inner: list[ast.AST | None] = []
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             inner = [node.value]
@@ -144,8 +150,22 @@ def _unread(tree: ast.AST) -> set[int]:
             inner = [node]
         elif isinstance(node, ast.Subscript):
             inner = [node.slice]
-        found.update(id(part) for one in inner if one is not None for part in ast.walk(one))
+        found.update(id(part) for one in inner if one is not None for part in nodes_of(one))
     return found - helped
+
+
+@cache
+def assigned(scope: ast.AST) -> dict[str, list[ast.expr]]:
+    """Return what is assigned to each name in a function, or on the top level of a module."""
+    found: dict[str, list[ast.expr]] = {}
+    for node in scope.body if isinstance(scope, ast.Module) else nodes_of(scope):
+        if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign | ast.NamedExpr):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = {target.id for target in targets if isinstance(target, ast.Name)}
+            if node.value is not None:
+                for name in names:
+                    found.setdefault(name, []).append(node.value)
+    return found
 
 
 class _Groups:
@@ -153,15 +173,15 @@ class _Groups:
 
     def __init__(self, tree: ast.Module) -> None:
         self.of: dict[int, str] = {}
-        self._functions = {n.name: n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+        self._functions = {n.name: n for n in nodes_of(tree) if isinstance(n, ast.FunctionDef)}
         self._module = tree
         self._scope: dict[int, ast.AST] = {}
         for function in self._functions.values():  # an inner function comes after its outer one
-            self._scope |= {id(node): function for node in ast.walk(function)}
+            self._scope |= {id(node): function for node in nodes_of(function)}
         self._since: dict[tuple[int, str], int] = {}  # the line of a name's last use, by its scope
-        self.of |= {id(part): HELP for one in _help_of(tree) for part in ast.walk(one)}
-        raised = [n for n in ast.walk(tree) if isinstance(n, ast.Raise) and n.exc is not None]
-        calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
+        self.of |= {id(part): HELP for one in _help_of(tree) for part in nodes_of(one)}
+        raised = [n for n in nodes_of(tree) if isinstance(n, ast.Raise) and n.exc is not None]
+        calls = [n for n in nodes_of(tree) if isinstance(n, ast.Call)]
         for call in sorted(calls, key=lambda one: one.lineno):
             if ast.unparse(call.func) == "Warning":
                 given = [*call.args, *(keyword.value for keyword in call.keywords)]
@@ -179,13 +199,7 @@ class _Groups:
 
     def _values(self, name: str, scope: ast.AST) -> list[ast.expr]:
         """Return what is assigned to a name in a function, or in the module where there is nothing."""
-        body = scope.body if isinstance(scope, ast.Module) else list(ast.walk(scope))
-        found = []
-        for node in body:
-            if isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign | ast.NamedExpr):
-                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-                if node.value and any(isinstance(t, ast.Name) and t.id == name for t in targets):
-                    found.append(node.value)
+        found = assigned(scope).get(name, [])
         if not found and not isinstance(scope, ast.Module):
             return self._values(name, self._module)
         return found
@@ -199,9 +213,9 @@ class _Groups:
         use: ast.Call | None = None,
     ) -> None:
         called = (
-            {part.func for part in ast.walk(node) if isinstance(part, ast.Call)} if node else set()
+            {part.func for part in nodes_of(node) if isinstance(part, ast.Call)} if node else set()
         )
-        for part in ast.walk(node) if node is not None else ():
+        for part in nodes_of(node) if node is not None else ():
             if isinstance(part, ast.Constant | ast.JoinedStr):
                 self.of.setdefault(id(part), group)
             elif isinstance(part, ast.Name) and part.id not in seen:
@@ -224,7 +238,7 @@ def texts_of(tree: ast.Module) -> Iterator[Text]:
     unread, groups = _unread(tree), _Groups(tree).of
     found = [
         node
-        for node in ast.walk(tree)
+        for node in nodes_of(tree)
         if isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in unread
     ]
     for node in sorted(found, key=lambda one: (one.lineno, one.col_offset)):
@@ -242,6 +256,8 @@ def messages() -> dict[str, list[Text]]:
         if not name.startswith(SKIPPED):
             texts = list(dict.fromkeys(texts_of(ast.parse(path.read_text(encoding="utf-8")))))
             found |= {name: texts} if texts else {}
+            nodes_of.cache_clear()
+            assigned.cache_clear()
     return found
 
 

@@ -26,6 +26,8 @@ from orthaug.commands.advice import (
 from orthaug.commands.motion import _has_term
 from orthaug.reports.page_verdict import fit_verdict
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 LAGGED = """
 [data]
 sampling_time = 0.01

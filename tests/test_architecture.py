@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -156,8 +157,9 @@ def room_of(name: str) -> str:
     return name.partition(".")[0]
 
 
-def all_imports(name: str) -> list[tuple[int, str]]:
-    return list(imports_of(name, parsed(FILES[name]), FILES[name].name == "__init__.py"))
+@cache
+def all_imports(name: str) -> tuple[tuple[int, str], ...]:
+    return tuple(imports_of(name, parsed(FILES[name]), FILES[name].name == "__init__.py"))
 
 
 def breaches(name: str, tree: ast.AST, is_package: bool = False) -> list[str]:
@@ -191,6 +193,7 @@ def files_imported(name: str) -> set[str]:
     return found - {name}
 
 
+@cache
 def handed_on(room: str) -> dict[str, str]:
     """The names of a room's face, with the file that each comes from."""
     face = FILES[room].with_suffix(".pyi")

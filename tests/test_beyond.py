@@ -13,6 +13,8 @@ import orthaug as oa
 from orthaug import stability
 from orthaug.analysis.beyond_training import describe_beyond
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def plant(rows=600, amplitude=1.0, seed=0, noise=0.0) -> oa.Record:
     """A stable linear plant with a cubic term, whose input is held for five samples."""

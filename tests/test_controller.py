@@ -18,6 +18,8 @@ from test_cli import run
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 TS, ROWS = 0.02, 500
 TRUE = {"a": 9.0, "c": 0.3, "b": 2.0}
 GAINS = {"Kp": 30.0, "Ki": 10.0, "Kd": 6.0, "filter": 0.02}

@@ -141,14 +141,30 @@ def test_sensor_noise(seed):
 
 
 @pytest.mark.parametrize(
-    ("rows", "seed"), [(4000, 0), (4000, 1), (4000, 8), (6000, 2), (10000, 0), (10000, 1)]
+    ("rows", "seed"),
+    [
+        (4000, 0),
+        (10000, 0),
+        *(
+            pytest.param(*draw, marks=pytest.mark.proof)
+            for draw in ((4000, 1), (4000, 8), (6000, 2), (10000, 1))
+        ),
+    ],
 )
 def test_sensor_noise_of_the_mass_spring_damper(rows, seed):
     assert of(spring(rows, seed)).verdict == "sensor_noise"
 
 
 @pytest.mark.parametrize(
-    ("rows", "seed"), [(4000, 0), (4000, 2), (4000, 5), (10000, 0), (10000, 1)]
+    ("rows", "seed"),
+    [
+        (4000, 0),
+        (10000, 0),
+        *(
+            pytest.param(*draw, marks=pytest.mark.proof)
+            for draw in ((4000, 2), (4000, 5), (10000, 1))
+        ),
+    ],
 )
 def test_sensor_noise_of_the_mass_spring_damper_with_a_learner(rows, seed):
     assert of(spring(rows, seed), **EVIDENCE).verdict == "sensor_noise"

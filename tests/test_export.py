@@ -38,7 +38,7 @@ from orthaug.models.learners import ACTIVATIONS, Bound
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.starts import EstimatedStates
 
-POINTS, STEPS = 1000, 10_000
+POINTS, STEPS = 1000, 2000
 STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow")
 
 

@@ -10,6 +10,8 @@ from test_cli import run
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 PHYSICS = oa.Baseline.from_terms(
     [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
 )

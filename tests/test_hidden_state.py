@@ -14,6 +14,8 @@ import orthaug as oa
 from orthaug.analysis.family_tests import Family, _test_families
 from orthaug.analysis.parameter_changes import _turn_of
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 TS = 0.05
 DATA = '[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = 0.05\ntrain = { files = ["run.csv"] }\n'
 MOTION = """[motion]

@@ -11,6 +11,8 @@ from test_cli import run, write_csv
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 LAGGED = """
 [data]
 sampling_time = 0.1

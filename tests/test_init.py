@@ -27,6 +27,8 @@ from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import column_names
 from orthaug.selection import first_orders
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def plant(rows: int = 600) -> tuple[np.ndarray, np.ndarray]:
     """y_k = 1.5 y_{k-1} − 0.7 y_{k-2} + 0.4 u_{k-3}, with noise on the sensor."""

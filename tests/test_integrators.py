@@ -14,6 +14,8 @@ from test_cli import finite_json, run
 import orthaug as oa
 from orthaug.physics.integrators import INTEGRATORS, Integrator
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STEP = 0.05  # s
 
 SPEC = """

@@ -10,6 +10,8 @@ from test_cli import run
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STEP, ROWS, TRAIN = 0.02, 2400, 1600
 TRUE = {"m": 1.0, "k": 4.0}
 

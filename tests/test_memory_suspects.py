@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 from test_cli import finite_json, run
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STEP, LAG = 0.05, 0.4  # s
 POLE = float(np.exp(-STEP / LAG))
 

@@ -13,6 +13,8 @@ import orthaug as oa
 from orthaug.data.gaps import complete_record, held_rows, regular_rows
 from orthaug.data.wild import data_warnings
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 STEP = 0.05
 TRUE = {"tau": 0.8, "gain": 2.0}
 

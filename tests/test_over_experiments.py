@@ -13,6 +13,8 @@ from test_cli import run
 import orthaug as oa
 from orthaug import Record
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 PHYSICS = oa.Baseline.from_terms(
     [oa.Term("a", "y[k-1]", initial=0.5), oa.Term("b", "u[k-1]", initial=0.3)]
 )

@@ -23,9 +23,12 @@ from orthaug.reports.page_fit import FitPage
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 CHROMIUM = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium is installed; set CHROMIUM to its file"
-)
+pytestmark = [
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="no Chromium is installed; set CHROMIUM to its file"
+    ),
+    pytest.mark.usefixtures("without_figures"),
+]
 
 ROWS = 100_000
 

@@ -7,6 +7,8 @@ import json
 import pytest
 from test_cli import run
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 SPEC = """
 [data]
 sampling_time = 0.001638400

@@ -25,6 +25,8 @@ from orthaug.physics import consent
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 NAMES = ("m", "c", "k")
 
 

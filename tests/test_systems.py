@@ -15,6 +15,8 @@ import orthaug as oa
 from orthaug import HammersteinWiener, Record
 from orthaug.physics.systems import SYSTEMS
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 A, B = np.array([-1.2, 0.5]), np.array([1.0, 2 / 3])
 
 

@@ -11,6 +11,8 @@ from test_cli import run
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 TRUE = {"m": 1.0, "c": 0.6, "k": 12.0}
 SPEC = """
 [data]

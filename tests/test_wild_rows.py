@@ -14,6 +14,8 @@ import orthaug as oa
 from orthaug.analysis.diagnosis import _marking
 from orthaug.data import Outliers, prepare
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def warned(wrong: float, at: int = 150) -> list[str]:
     rng = np.random.default_rng(1)
