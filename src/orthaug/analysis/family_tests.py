@@ -30,6 +30,7 @@ STATIC = "static"
 """Kind of a family of functions of one row."""
 
 _LEVEL = 0.01
+_DIGITS = 9  # of a share that are no rounding
 _ROWS_PER_COLUMN = 4
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 
@@ -225,8 +226,11 @@ def _at_most(share: Share, most: float) -> Share:
     return Share(most, share.error * most / share.value)
 
 
+def by_share(entries: list[FamilyTest]) -> list[FamilyTest]:
+    """Return families by falling share; those that span the same rows keep their order."""
+    return sorted(entries, key=lambda entry: -round(entry.share, _DIGITS))
+
+
 def best_family(entries: list[FamilyTest]) -> FamilyTest | None:
     """Return the family with the largest share of those that are sure; None without any."""
-    return max(
-        (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
-    )
+    return next(iter(by_share([entry for entry in entries if entry.sure])), None)
