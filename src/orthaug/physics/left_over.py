@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.parallel import one_blas_thread
@@ -277,8 +277,8 @@ class _Smoother:
         return found / np.sqrt(1 + 1 / _NEIGHBOURS)
 
     @cached_property
-    def _nearest(self) -> list[Int[np.ndarray, "r n"]]:
-        """The nearest rows of other stretches for the rows of each fold, among the former."""
+    def _nearest(self) -> list[Any]:
+        """The nearest rows (r, n) of other stretches for those of each fold, among the former."""
         from scipy.spatial import KDTree  # slow to import, and few fits need it
 
         folds = [self.fold == fold for fold in range(_FOLDS)]
