@@ -25,7 +25,7 @@ from orthaug.commands.demo import SPEC as DAMPER
 from orthaug.studies import synthetic
 
 IMPORTS = ("jax", "matplotlib.pyplot", "pandas")
-COMMAND = "from orthaug.commands.cli import main; main()"
+COMMAND = "from orthaug.commands.entry import main; main()"
 STATIC = """
 [data]
 inputs = {inputs}

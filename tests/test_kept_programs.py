@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +33,8 @@ from orthaug.models.dynamics import Parts
 ROOT = Path(__file__).resolve().parents[1]
 FIT = """
 import sys
+import threading
+import time
 import numpy as np
 from orthaug._base.jax import jax, use_compilation_cache
 use_compilation_cache()
@@ -175,3 +180,26 @@ def test_a_function_of_the_host_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> 
     call = call_of(of_module, ("scale",), np.ones(2), Host(), None)
     assert KeptPrograms(cache).call(of_module, call, None) is NotImplemented
     assert not cache
+
+
+def test_runs_that_ask_together_share_one_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_programs, "_CODE_OF", (*kept_programs._CODE_OF, __name__))
+    asked, both = [], threading.Barrier(2)
+
+    class SlowCache(MemoryCache):
+        def get(self, key: str, default: Any = None) -> Any:
+            asked.append(key)
+            time.sleep(0.2)  # so that the other one asks meanwhile
+            return super().get(key, default)
+
+    programs = KeptPrograms(SlowCache())
+    parts = Parts(np.ones(2), np.ones(2), np.ones(2))
+
+    def result(start: float) -> Any:
+        both.wait()
+        call = call_of(of_module, ("scale",), start + np.arange(3.0), 2, parts)
+        return programs.call(of_module, call, None)[1][0]
+
+    with ThreadPoolExecutor(2) as pool:
+        assert [float(total) for total in pool.map(result, (0.0, 1.0))] == [3.0, 6.0]
+    assert len(asked) == 1

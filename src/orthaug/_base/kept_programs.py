@@ -17,6 +17,7 @@ import inspect
 import json
 import struct
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -184,6 +185,8 @@ class KeptPrograms:
     def __init__(self, cache: Any) -> None:
         self._cache = cache
         self._known: dict[Any, Program | None] = {}
+        self._making: dict[Any, threading.RLock] = {}
+        self._entering = threading.Lock()
 
     def clear(self) -> None:
         """Let the programs in memory go."""
@@ -198,13 +201,28 @@ class KeptPrograms:
             effort: options of the compiler.
         """
         key = (function, call.key, effort is None)
-        if key not in self._known:
+        known = key in self._known
+        program = self._known[key] if known else self._make(key, function, call, effort)
+        return NotImplemented if program is None else program(call.arrays)
+
+    def _make(
+        self,
+        key: Any,
+        function: Callable[..., Any],
+        call: Call,
+        effort: Mapping[str, Any] | None,
+    ) -> Program | None:
+        """Return the program of a call, made once: runs in threads ask for it together."""
+        with self._entering:
+            making = self._making.setdefault(key, threading.RLock())
+        with making:
+            if key in self._known:
+                return self._known[key]
             try:
                 self._known[key] = self._program(function, call, effort)
             except Exception:  # what JAX cannot export, and how it says so, changes by version
                 self._known[key] = None
-        program = self._known[key]
-        return NotImplemented if program is None else program(call.arrays)
+            return self._known[key]
 
     def _program(
         self, function: Callable[..., Any], call: Call, effort: Mapping[str, Any] | None

@@ -30,6 +30,7 @@ STATIC = "static"
 """Kind of a family of functions of one row."""
 
 _LEVEL = 0.01
+_DIGITS = 9  # of a share that are no rounding
 _ROWS_PER_COLUMN = 4
 _OWN = 1e-3  # of a column's size: what is left of it beside the model, so that it is one of its own
 
@@ -157,8 +158,9 @@ class Candidates:
             [np.full(len(family.terms), family.kind == STATIC) for family in families]
         )
         own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
-        beside = _test_families(whole, own, known, families, size, shift)
-        hidden = _test_families(whole, own + simple, known, families, size, None)
+        turn, reduced = np.linalg.qr(whole)  # few rows say of the columns what all rows say
+        beside = _test_families(turn, reduced, own, known, families, size, shift)
+        hidden = _test_families(turn, reduced, own + simple, known, families, size, None)
         return Tests(whole, known, size, beside, hidden)
 
     def places_of(self, one: FamilyTest) -> list[int]:
@@ -172,6 +174,7 @@ class Candidates:
 
 
 def _test_families(
+    turn: Matrix,
     whole: Matrix,
     base: list[int],
     known: int,
@@ -181,13 +184,13 @@ def _test_families(
 ) -> list[FamilyTest]:
     """Test every family beside the columns of a base.
 
-    `size` are the norms that columns were divided by.
+    Rows are `turn @ whole`, a QR factorisation. `size` are the norms that columns were divided by.
     """
     q = span(whole[:, base], RANK)
     rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
     target, terms = rest[:, -1], rest[:, :-1]
-    total, left = float(target @ target), len(whole) - q.shape[1]
-    sums = BlockSums.of(np.concatenate([q, terms], axis=1), whole[:, -1])
+    total, left = float(target @ target), len(turn) - q.shape[1]
+    sums = BlockSums.of(turn @ np.concatenate([q, terms], axis=1), turn @ whole[:, -1])
     blocks, found, place = list(range(q.shape[1])), [], 0
     for family in families:
         own = list(range(place, place + len(family.terms)))
@@ -223,8 +226,11 @@ def _at_most(share: Share, most: float) -> Share:
     return Share(most, share.error * most / share.value)
 
 
+def by_share(entries: list[FamilyTest]) -> list[FamilyTest]:
+    """Return families by falling share; those that span the same rows keep their order."""
+    return sorted(entries, key=lambda entry: -round(entry.share, _DIGITS))
+
+
 def best_family(entries: list[FamilyTest]) -> FamilyTest | None:
     """Return the family with the largest share of those that are sure; None without any."""
-    return max(
-        (entry for entry in entries if entry.sure), key=lambda entry: entry.share, default=None
-    )
+    return next(iter(by_share([entry for entry in entries if entry.sure])), None)

@@ -17,7 +17,14 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import span
-from orthaug.analysis.family_tests import STATIC, Candidates, Family, FamilyTest, best_family
+from orthaug.analysis.family_tests import (
+    STATIC,
+    Candidates,
+    Family,
+    FamilyTest,
+    best_family,
+    by_share,
+)
 from orthaug.analysis.filtered_rows import (
     RANK,
     error_colours,
@@ -461,6 +468,6 @@ def _structure_of(candidates: Candidates) -> StructureTest | None:
         static,
         best_family(memory),
         best_family([entry for entry in tests.hidden if entry.kind in KINDS]),
-        tuple(sorted(memory, key=lambda entry: -entry.share)),
+        tuple(by_share(memory)),
     )
     return replace(found, drift=find_change(candidates, tests, [static, found.memory]))

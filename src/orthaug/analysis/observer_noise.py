@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import TypeGuard
 
 import numpy as np
-import scipy.optimize
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -144,6 +143,8 @@ def most_likely(model: Model, begun: Noise, record: Record, rows: int = _TUNED_R
 
     if not any(free) or not stretches:
         return begun
+    from scipy import optimize  # slow to import
+
     begin = np.concatenate([np.zeros((1, sum(free))), _STEP * np.eye(sum(free))])
     options = {"xatol": 0.02, "fatol": 0.02, "maxiter": 80, "initial_simplex": begin}
-    return noise(scipy.optimize.minimize(cost, begin[0], method="Nelder-Mead", options=options).x)
+    return noise(optimize.minimize(cost, begin[0], method="Nelder-Mead", options=options).x)

@@ -7,6 +7,7 @@ a state's derivative of a motion.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -53,14 +54,32 @@ class LinearRun:
         start: Matrix,
     ) -> Float[np.ndarray, "T ny k"]:
         """Return Δy of k columns added to state and output of each step, from s (n0, k) = start."""
-        found = np.array(into_output, dtype=float)
-        if not self.states.shape[1]:
-            return found
-        state = start
-        for t in range(len(found)):
-            found[t] += self.to_output[t] @ state
-            state = self.to_state[t] @ state + into_state[t]
-        return found
+        (t, n0), k = self.states.shape, start.shape[1]
+        if not n0:
+            return np.array(into_output, dtype=float)
+        # The steps of √T blocks side by side: a first time for how each block's end follows its
+        # beginning, from rest and from unit states, and a second time from where blocks begin
+        blocks = math.isqrt(t)
+        length = -(-t // blocks)
+        a, b, c, found = (
+            np.pad(part, ((0, blocks * length - t), (0, 0), (0, 0))).reshape(
+                blocks, length, *part.shape[1:]
+            )
+            for part in (self.to_state, into_state, self.to_output, into_output)
+        )
+        ends = np.broadcast_to(np.eye(n0, n0 + k), (blocks, n0, n0 + k))
+        for step in range(length):
+            ends = a[:, step] @ ends
+            ends[..., n0:] += b[:, step]
+        state = np.empty((blocks, n0, k))
+        state[0] = start
+        for block in range(1, blocks):
+            before = ends[block - 1]
+            state[block] = before[:, :n0] @ state[block - 1] + before[:, n0:]
+        for step in range(length):
+            found[:, step] += c[:, step] @ state
+            state = a[:, step] @ state + b[:, step]
+        return found.reshape(-1, *into_output.shape[1:])[:t]
 
     def starts(self) -> Float[np.ndarray, "T ny n0"]:
         """Compute how the outputs follow the state at the first row."""

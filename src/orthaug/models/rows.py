@@ -27,7 +27,7 @@ from orthaug.physics.noise import FilterRows, RowFilter
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
 # Rows: so few take less time than to compile for their number, or for that of a fold
-_FEW, _SHARED = (1024, 256)
+_FEW, _SHARED = (1024, 512)
 
 
 class Chunk(NamedTuple):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -247,27 +248,38 @@ class _Smoother:
 
     def _by_functions(self, values: Matrix, ridge: float) -> Matrix:
         """Return predictions by least squares on many functions of the features."""
-        plain = np.column_stack([np.ones(len(self.z)), self.z, self.functions])
-        plain = plain / np.maximum(np.sqrt(np.mean(plain**2, axis=0)), 1e-300)
         rest = np.empty_like(values)
         low, high = values.min(axis=0), values.max(axis=0)
-        for fold in range(_FOLDS):
-            there, here = plain[self.fold != fold], self.fold == fold
-            gram = there.T @ there + ridge * len(there) * np.eye(plain.shape[1])
-            weights = np.linalg.solve(gram, there.T @ values[~here])
-            rest[here] = values[here] - np.clip(plain[here] @ weights, low, high)
+        for fold, (there, own, gram) in enumerate(self._regressions):
+            here = self.fold == fold
+            damped = gram + ridge * len(there) * np.eye(len(gram))
+            weights = np.linalg.solve(damped, there.T @ values[~here])
+            rest[here] = values[here] - np.clip(own @ weights, low, high)
         return rest
+
+    @cached_property
+    def _regressions(self) -> list[tuple[Matrix, Matrix, Matrix]]:
+        """Functions on other stretches and on that of each fold; Gram matrix of the former."""
+        plain = np.column_stack([np.ones(len(self.z)), self.z, self.functions])
+        plain = plain / np.maximum(np.sqrt(np.mean(plain**2, axis=0)), 1e-300)
+        parts = [(plain[self.fold != fold], plain[self.fold == fold]) for fold in range(_FOLDS)]
+        return [(there, own, there.T @ there) for there, own in parts]
 
     def _by_neighbours(self, rest: Matrix) -> Matrix:
         """Return predictions by the mean of the nearest rows of other stretches.
 
         The error of that mean itself is taken out.
         """
-        from scipy.spatial import KDTree  # slow to import, and few fits need it
-
         found = np.empty_like(rest)
-        for fold in range(_FOLDS):
+        for fold, nearest in enumerate(self._nearest):
             here = self.fold == fold
-            nearest = KDTree(self.z[~here]).query(self.z[here], k=_NEIGHBOURS)[1]
             found[here] = rest[here] - rest[~here][nearest].mean(axis=1)
         return found / np.sqrt(1 + 1 / _NEIGHBOURS)
+
+    @cached_property
+    def _nearest(self) -> list[Any]:
+        """The nearest rows (r, n) of other stretches for those of each fold, among the former."""
+        from scipy.spatial import KDTree  # slow to import, and few fits need it
+
+        folds = [self.fold == fold for fold in range(_FOLDS)]
+        return [KDTree(self.z[~here]).query(self.z[here], k=_NEIGHBOURS)[1] for here in folds]

@@ -47,7 +47,7 @@ def _own_style() -> AbstractContextManager[None]:
     own: dict[Any, Any] = {
         key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")
     }
-    own |= {"text.parse_math": False}
+    own |= {"text.parse_math": False, "text.hinting": "none"}
     return rc_context({key: value for key, value in own.items() if rcParams[key] != value})
 
 
