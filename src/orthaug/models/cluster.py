@@ -100,7 +100,7 @@ class Dask(Threads):
             return [self._task_on(task, partition) for partition in source.partitions]
 
     def sum(
-        self, function: Callable[..., Result], rows: Sequence[Any], *arguments: object
+        self, function: Callable[..., Result], rows: Sequence[object], *arguments: object
     ) -> Result:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
@@ -242,7 +242,7 @@ def keep_on_worker(value: Result) -> Result:
     return value
 
 
-def _pair_chunks(groups: Any) -> list[Any]:
+def _pair_chunks(groups: Any) -> list[object]:
     """Return the chunks of a group; of a tuple of groups, tuples of their chunks."""
     return (
         list(zip(*map(_pair_chunks, groups), strict=True)) if isinstance(groups, tuple) else groups

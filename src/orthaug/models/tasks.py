@@ -121,7 +121,7 @@ def ask(
     check: Callable[[], None],
     function: Callable[..., Result],
     *args: object,
-    **named: Any,
+    **named: object,
 ) -> Result:
     """Return the result of a function that a worker computes.
 
