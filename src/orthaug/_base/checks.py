@@ -153,7 +153,7 @@ def check_all(values: Any, kind: type, name: str, example: str) -> None:
         raise InputError(f"`{name}` must be a list such as [{example}]; got {show(wrong[0])}.")
 
 
-def check_type(value: Any, kinds: Any, name: str, wanted: str) -> None:
+def check_type(value: object, kinds: Any, name: str, wanted: str) -> None:
     """Raise InputError unless `value` is an instance of `kinds` (a class itself is none)."""
     if isinstance(value, type) or not isinstance(value, kinds):
         raise InputError(f"`{name}` must be {wanted}; got {show(value)}.")

@@ -41,7 +41,7 @@ Wholes = Annotated[list[int], BeforeValidator(_plain)]
 ByName = dict[str, Number]
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Return a value for JSON: NumPy's as Python's own, tuples as lists, None for NaN and ∞."""
     if isinstance(value, dict):
         return {name: plain(entry) for name, entry in value.items()}

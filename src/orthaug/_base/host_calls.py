@@ -30,8 +30,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
-from orthaug._base.jax import jax, jnp
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import Array, jax, jnp
 
 _TARGET = "orthaug_host_call"
 _METADATA = 1  # the extension by which XLA asks for the version of a handler
@@ -57,7 +57,7 @@ class HostFunction(Protocol):
         ...
 
 
-def call_on_host(function: HostFunction, row: Any) -> tuple[Any, ...]:
+def call_on_host(function: HostFunction, row: Array) -> tuple[Array, ...]:
     """Return the results of a function at a row (n,) on JAX arrays, under `vmap` at all rows.
 
     It has no derivatives; give them by `jax.custom_jvp`.
@@ -82,7 +82,7 @@ def _number_of(function: HostFunction) -> int:
     return len(_FUNCTIONS) - 1
 
 
-def _at_different_rows(function: HostFunction, rows: Matrix) -> tuple[Any, ...]:
+def _at_different_rows(function: HostFunction, rows: Matrix) -> tuple[np.ndarray, ...]:
     """Return the results at rows; those that repeat the one before are computed once.
 
     Compiled programs pad theirs so.
@@ -222,7 +222,7 @@ def _answer(frame: Any) -> int | None:
     return None
 
 
-def _numbers_at(address: int, count: int) -> Any:
+def _numbers_at(address: int, count: int) -> Vector:
     """Return the numbers at an address, without a copy."""
     if not count:
         return np.zeros(0)

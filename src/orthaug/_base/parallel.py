@@ -12,10 +12,11 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
 
+Given = TypeVar("Given")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Heard = Callable[..., None]
@@ -123,7 +124,7 @@ def iterate_results(
                 future.cancel()
 
 
-def nobody(*_: Any) -> None:
+def nobody(*_: object) -> None:
     """Ignore a report."""
 
 
@@ -132,9 +133,9 @@ class Threads:
 
     def map(
         self,
-        function: Callable[[Any, Any, Callable[..., None]], Result],
-        given: Any,
-        items: Sequence[Any],
+        function: Callable[[Given, Item, Callable[..., None]], Result],
+        given: Given,
+        items: Sequence[Item],
         heard: Heard = nobody,
     ) -> Iterator[Result]:
         """Yield `function(given, item, report)` of every item in order.
@@ -147,10 +148,10 @@ class Threads:
             heard: called with the number of an item and the reports of its run.
         """
 
-        def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Result:
+        def one(numbered: tuple[int, Item], check: Callable[[], None]) -> Result:
             i, item = numbered
 
-            def report(*what: Any) -> None:
+            def report(*what: object) -> None:
                 check()
                 heard(i, *what)
 

@@ -45,7 +45,7 @@ _STAGE_LOG, _MODEL_LOG = LOG.getChild("stage"), LOG.getChild("model")
 _MODEL_LOG.propagate = False  # its records are no text
 
 
-def show_model(name: str, fit: Callable[[], Any], record: Any) -> None:
+def show_model(name: str, fit: Callable[[], object], record: object) -> None:
     """Hand a fit that training has reached to who follows this process.
 
     Args:

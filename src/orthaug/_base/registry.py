@@ -205,7 +205,7 @@ class Registry(Mapping[str, Any]):
                     return kind, key
         return None
 
-    def declare(self, kind: str, values: Mapping[str, Any]) -> Any:
+    def declare(self, kind: str, values: Mapping[str, object]) -> Any:
         """Return the declaration of a kind; `values` of keys that it does not have are left out.
 
         Raises:
@@ -238,12 +238,12 @@ def keys_of(declaration: type) -> dict[str, Key]:
     }
 
 
-def resolve(declared: Any, context: Any = None) -> Any:
+def resolve(declared: Any, context: object = None) -> Any:
     """Return a declaration itself, or the result of its `resolve(context)`."""
     return declared.resolve(context) if hasattr(declared, "resolve") else declared
 
 
-def check_fields(declared: Any) -> None:
+def check_fields(declared: object) -> None:
     """Raise InputError for a field outside the limits of its type.
 
     It is called in the `__post_init__` of declarations.
@@ -266,13 +266,13 @@ def check_fields(declared: Any) -> None:
             raise InputError(f"`{name}` must be {high} or less; got {value}.")
 
 
-def _default(field: dataclasses.Field[Any]) -> Any:
+def _default(field: dataclasses.Field[object]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
 
 
-def freeze(value: Any) -> Any:
+def freeze(value: object) -> Any:
     """Return lists, as files hold them, as tuples."""
     if isinstance(value, list | tuple):
         return tuple(freeze(item) for item in value)

@@ -199,7 +199,7 @@ class Waves:
 
     inputs: tuple[str, ...] | None = None
 
-    def init(self, key: Any, nz: int, ny: int) -> Any:
+    def init(self, key: object, nz: int, ny: int) -> Any:
         return jnp.zeros((ny, 1 + nz + WAVES))
 
     def apply(self, tree: Any, z: Any) -> Any:

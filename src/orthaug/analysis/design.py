@@ -166,7 +166,7 @@ def design_motion_input(
     )
 
 
-def set_known(plant: DesignPlant, known_inputs: Mapping[str, Any] | None, samples: int) -> None:
+def set_known(plant: DesignPlant, known_inputs: Mapping[str, object] | None, samples: int) -> None:
     """Give a plant the samples (N,) of inputs beside the one that is designed, by name.
 
     InputError for wrong ones.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from orthaug._base.checks import check_count, check_type
 from orthaug._base.errors import InputError, Warning
@@ -34,6 +34,11 @@ from orthaug.models.tasks import runs_on
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.problem import MotionProblem, PosedProblem, Problem
 
+if TYPE_CHECKING:
+    from orthaug._base.parallel import Threads
+    from orthaug.models.rows import Engine
+
+
 DEFAULT_BLOCKS = 4
 """Blocks of cross-validation where no part is held out."""
 
@@ -60,7 +65,7 @@ class Evidence:
     """True if physical parameters get profile intervals, too."""
     blocks: int | None = None
     """Blocks of cross-validation; None for none beside held-out parts, else `DEFAULT_BLOCKS`."""
-    runner: Any = InMemory()  # noqa: RUF009  (frozen)
+    runner: Threads | Engine = InMemory()  # noqa: RUF009  (frozen)
     """Makes the fits of cross-validation."""
     warnings: tuple[Warning, ...] = ()
     """Warnings on the data and on what was left out before training."""

@@ -238,7 +238,7 @@ def _with_biases(
     ]
 
 
-def _of_learner(fit: Estimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
+def _of_learner(fit: Estimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, object]:
     """Return intervals over experiments, and the equations of a learner of terms."""
     over = attempt(
         "the errors over experiments",
@@ -246,7 +246,7 @@ def _of_learner(fit: Estimate, evidence: Evidence, warnings: list[Warning]) -> d
         warnings,
         None,
     )
-    content: dict[str, Any] = {"over_experiments": over} if over else {}
+    content: dict[str, object] = {"over_experiments": over} if over else {}
     terms = learned_terms(fit.model)
     if terms:
         written = {writing: equation(fit.model, writing) for writing in ("text", "latex")}
@@ -292,7 +292,7 @@ def _unexplained_warnings(fitted: Examination, physics: Callable[[], Any] | None
 
 def _over_experiments(
     fit: Any, evidence: Evidence, warnings: list[Warning]
-) -> dict[str, Any] | None:
+) -> dict[str, object] | None:
     """Return intervals for experiments like those fitted; None where these are too few.
 
     A warning is added where they differ by more than the fit's own intervals allow.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,10 @@ from orthaug.fitting.motion_task import MotionTask
 from orthaug.fitting.segmented_motion import SegmentedMotion
 from orthaug.models.learners import nothing_learned
 from orthaug.physics.problem import Problem
+
+if TYPE_CHECKING:
+    from orthaug.fitting.kinds import Solver
+
 
 _CLEARLY = 0.5  # of the error one step ahead: exchanged columns leave less
 _MOST_INPUTS = 5
@@ -91,7 +95,7 @@ def _read_by(record: Record, read: Matrix) -> Record:
     return replace(record, experiments=moved)
 
 
-def misread_inputs(task: MotionTask, solver: Any) -> tuple[Warning, ...]:
+def misread_inputs(task: MotionTask, solver: Solver) -> tuple[Warning, ...]:
     """Return a warning where a motion is far better with an input reversed, or two exchanged.
 
     Args:

@@ -284,7 +284,7 @@ class Findings(Content):
 
     _fit: Any = PrivateAttr(default=None)
 
-    def about(self, fit: Any) -> Self:
+    def about(self, fit: object) -> Self:
         """Return the findings with their `Estimate`, so that they can be printed and shown."""
         found = self.model_copy()
         found._fit = fit
@@ -307,7 +307,7 @@ class Findings(Content):
     def _repr_html_(self) -> str | None:
         return None if self._fit is None else MAKERS["findings"](self._fit, self, html=True)
 
-    def changed(self, **fields: Any) -> Self:
+    def changed(self, **fields: object) -> Self:
         """Return the findings with other fields, checked."""
         return type(self).model_validate({**dict(self), **fields})
 
@@ -330,7 +330,7 @@ def parameter_rows(
     values: Vector,
     std: Vector | None = None,
     interval: Matrix | None = None,
-    one_step: Any = None,
+    one_step: Vector | None = None,
     plain_std: Vector | None = None,
 ) -> list[ParameterResult]:
     """Return θ as results list it; a parameter at a bound has no interval."""

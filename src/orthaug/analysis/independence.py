@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.special
@@ -188,7 +187,9 @@ def _lag_blocks(e: list[Vector], u: list[Vector], a: Vector, lags: int) -> Itera
                 yield np.column_stack([np.ones(len(part)), windows[i : i + _ROWS], part])
 
 
-def _bin_blocks(e: list[Vector], placed: list[Any], a: Vector, bins: int) -> Iterator[Matrix]:
+def _bin_blocks(
+    e: list[Vector], placed: list[np.ndarray], a: Vector, bins: int
+) -> Iterator[Matrix]:
     """Yield rows of the indicators of all bins, filtered by A, between 1 and `A e_k`."""
     memory = len(a) - 1
     for one, bin_of in zip(e, placed, strict=True):

@@ -231,7 +231,7 @@ def search_input(
         ) from None
 
 
-def as_numbers(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+def as_numbers(values: object, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Return finite numbers of a shape; InputError for others."""
     try:
         numbers = np.broadcast_to(np.asarray(values, dtype=float), shape)

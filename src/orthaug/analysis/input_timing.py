@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,10 @@ from orthaug.fitting.whiteness import whitening_filter
 from orthaug.models.learners import Learner, nothing_learned
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.problem import MotionProblem
+
+if TYPE_CHECKING:
+    from orthaug.fitting.kinds import Solver
+
 
 Measure = Callable[[SegmentedMotion, FreeRunFit | None], float]
 """Size of the errors of a fit; inf without one."""
@@ -270,7 +274,7 @@ class LateInput:
         return Warning(code, f"{found} {remedy}")
 
 
-def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
+def find_late_inputs(task: MotionTask, solver: Solver) -> tuple[LateInput, ...]:
     """Return the inputs that act clearly later than in the equations, and by how much.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import Array, jax, jnp, quick_jit
+from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.inference.covariance import reach
 from orthaug.inference.splitting import rest_of
@@ -74,8 +74,8 @@ def _slopes(
     """Return the derivatives of the learner's part by p̂, and by (c, w)."""
     c = numbers.c
 
-    def at(x: Any, u: Any) -> Any:
-        def part(q: Any, c: Any, w: Any) -> Any:
+    def at(x: Array, u: Array) -> Any:
+        def part(q: AnyArray, c: AnyArray, w: AnyArray) -> Any:
             return rest_of(form, numbers, q, c, w, x, u, 1.0)
 
         by_q, by_c, by_w = jax.jacrev(part, (0, 1, 2))(numbers.theta, c, numbers.weights)

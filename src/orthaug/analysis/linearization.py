@@ -117,7 +117,7 @@ def _held_clause(search: Search, given: Mapping[str, float], record: Record | No
     return "zero" if record is None else "mean"
 
 
-def _frequencies(given: Any, step: float) -> Vector | None:
+def _frequencies(given: object, step: float) -> Vector | None:
     if given is None:
         return None
     try:

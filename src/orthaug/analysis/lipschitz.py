@@ -147,7 +147,7 @@ def _gradient_rows(
     def g(row: Array) -> Array:
         return form.at(numbers, row).total
 
-    def phi(row: Any) -> Any:
+    def phi(row: Array) -> Any:
         return form.phi(row)
 
     slope = jax.jacrev(g) if form.differentiable else partial(by_differences, g, width=width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -206,7 +206,7 @@ def products_of(names: tuple[str, ...]) -> list[Product]:
     return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
 
 
-def values_of(tried: Tried, sizes: Sizes, rows: Matrix) -> Any:
+def values_of(tried: Tried, sizes: Sizes, rows: Matrix) -> Matrix:
     """Return the terms (count, r) of states and inputs (nx + nu, r).
 
     Where a variable keeps its sign a jump at zero is a constant, and its size is itself: zeros take

@@ -199,7 +199,7 @@ def modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> Modes | None:
 def _slopes(
     form: MotionDynamics, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> Float[Array, "m nx nx"]:
-    def rate(x: Any, u: Any) -> Any:
+    def rate(x: Array, u: Array) -> Any:
         if form.motion.held:  # of a loop: the step from a sample to the next
             ends = 2 if form.motion.hold == "first-order" else 1
             return form.step(numbers, x, jnp.concatenate([form.external(u)] * ends))[0]

@@ -114,7 +114,7 @@ class Observations:
         import pandas as pd
 
         one = self.experiments[experiment]
-        columns: dict[str, Any] = {
+        columns: dict[str, object] = {
             "time": one.start_time + np.arange(len(one.square)) * self.sampling_time
         }
         for i, channel in enumerate(self.outputs):

@@ -277,7 +277,7 @@ def _band(mean: Vector, covariance: Any) -> Matrix:
     return np.stack([mean - reach, mean + reach])
 
 
-def _row(values: Any, name: str, count: int, *, gaps: bool = False) -> Vector:
+def _row(values: object, name: str, count: int, *, gaps: bool = False) -> Vector:
     try:
         row = np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):

@@ -196,7 +196,7 @@ def _linearise_run(form: Dynamics, numbers: Numbers, start: Array, rows: Array) 
         following, parts = form.step(own, state, row)
         return following, parts.total
 
-    def advance(state: Array, row: Array) -> tuple[Any, Any]:
+    def advance(state: Array, row: Array) -> tuple[Array, tuple[Array, Array]]:
         following, output = step(state, theta, row)
         return following, (state, output)
 

@@ -67,7 +67,7 @@ class Node(np.lib.mixins.NDArrayOperatorsMixin):
     def __init__(self, tape: Tape, slot: int):
         self.tape, self.slot = tape, slot
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any) -> Node:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: object) -> Node:
         return self.tape.record(ufunc, *arguments)
 
 
@@ -75,8 +75,8 @@ class Tape:
     """Tape of the NumPy operations of expressions, recorded once and repeated, each part once."""
 
     def __init__(self) -> None:
-        self.values: list[Any] = []
-        self.known: dict[Any, Node] = {}
+        self.values: list[object] = []
+        self.known: dict[object, Node] = {}
         self.steps: list[tuple[Callable[..., Any], int, int, int]] = []
         self.lags: dict[Lag, int] = {}
 
@@ -104,13 +104,13 @@ class Tape:
     def total(self, values: Sequence[Node]) -> Node:
         return sum(values[1:], values[0]) if values else self.asarray(0.0)
 
-    def _node(self, key: Any, value: Any = None) -> Node:
+    def _node(self, key: object, value: object = None) -> Node:
         if key not in self.known:
             self.known[key] = Node(self, len(self.values))
             self.values.append(value)
         return self.known[key]
 
-    def replay(self, columns: Iterable[Any], wanted: Sequence[int]) -> list[Any]:
+    def replay(self, columns: Iterable[object], wanted: Sequence[int]) -> list[Any]:
         """Return values of the wanted slots from one column for each of `lags`, in their order."""
         values = self.values
         for slot, column in zip(self.lags.values(), columns, strict=True):

@@ -37,7 +37,7 @@ _ROUGH = (
 _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlett's weights fade
 
 
-def with_suited_errors(fit: Any, *, ordered: bool = True) -> Any:
+def with_suited_errors(fit: Estimate, *, ordered: bool = True) -> Estimate:
     """Return a fit of rows in memory with the standard errors that suit its errors.
 
     As `robust_where_asked`; the fit as it is where that fails.
@@ -50,7 +50,7 @@ def with_suited_errors(fit: Any, *, ordered: bool = True) -> Any:
     return attempt("the robust covariance", lambda: _suited(fit, ordered=ordered), [], fit)
 
 
-def _suited(fit: Any, *, ordered: bool) -> Any:
+def _suited(fit: Estimate, *, ordered: bool) -> Estimate:
     """Return `with_suited_errors`; plain errors of coloured ones come with a warning."""
     record, simulates = fit.problem.record, fit.criterion.free_run is not None
     response = None if simulates else fit.model.predict(record)
@@ -102,7 +102,7 @@ def robust_where_asked(fit: Estimate, response: Response, *, ordered: bool = Tru
     return _robust(fit, None, "hc3")
 
 
-def robust_free_run(fit: Any) -> Any:
+def robust_free_run(fit: Estimate) -> Estimate:
     """Return the fit of a free run with standard errors by batch means, where errors are coloured.
 
     Where they are coloured and the record holds too few stretches that do not remember each other
@@ -124,7 +124,7 @@ def robust_free_run(fit: Any) -> Any:
     return _robust(fit, _SHORT, "batch-means-uneven")
 
 
-def _by_colour(fit: Any) -> Any:
+def _by_colour(fit: Any) -> Estimate:
     """Return the fit with the standard errors of an autoregressive model of its errors.
 
     Without any where these are few.
@@ -156,7 +156,7 @@ def _has_rows(fit: Estimate, rows: int) -> bool:
     return rows >= _FEWEST_TESTED and rows * len(fit.problem.deviation) * len(gram) <= LARGEST
 
 
-def _is_uneven(fit: Any, slopes: Any, errors: Matrix) -> bool:
+def _is_uneven(fit: Estimate, slopes: Any, errors: Matrix) -> bool:
     """Return whether White's test finds the errors' size related to the parameters' slopes."""
     made = fit.moves_by()
     if made is None or not np.isfinite(slopes).all() or not np.isfinite(errors).all():
@@ -239,7 +239,7 @@ def _memory(fit: Estimate, response: Response) -> int | None:
     return _MEMORIES * memory or None
 
 
-def block_of(fit: Any) -> int | None:
+def block_of(fit: Estimate) -> int | None:
     """Return steps of a block for the errors of the free run.
 
     None where these are white, or leave too few blocks.

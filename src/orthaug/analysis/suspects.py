@@ -395,7 +395,7 @@ def check_name(name: Any) -> None:
         raise InputError(f"{name!r} cannot name a suspect; use visible characters on one line.")
 
 
-def check_coefficient(suspect: str, coefficient: Any) -> None:
+def check_coefficient(suspect: str, coefficient: object) -> None:
     """Raise InputError for a coefficient that is no number."""
     if coefficient is not None and not is_number(coefficient):
         raise InputError(
@@ -421,7 +421,7 @@ def suspect_text(
     kind: str,
     on: str | None,
     width: float | None,
-    read: Callable[[str], Any],
+    read: Callable[[str], object],
     example: str,
     time_constant: float | None = None,
 ) -> tuple[str, str, str | None]:

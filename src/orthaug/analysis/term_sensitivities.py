@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, padded_length, quick_jit
+from orthaug._base.jax import AnyArray, Array, padded_length, quick_jit
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
@@ -146,7 +146,9 @@ def _ends(rows: Matrix, n0: int, hold: str) -> Matrix:
     return ends
 
 
-def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[Any, Any, Any]:
+def _at_rows(
+    form: MotionDynamics, numbers: Numbers, x: AnyArray, u: AnyArray
+) -> tuple[Any, Any, Any]:
     """Return slopes (m, T, n0, n0 + n), outputs (m, T, ny) and their slopes at every row.
 
     Slopes of outputs are (m, T, ny, n0 + n).
@@ -166,10 +168,10 @@ def _at_rows(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> tuple[An
 
 
 def _propagate(
-    to_next: Any,
-    to_output: Any,
-    added: Any,
-    at_ends: Any,
+    to_next: np.ndarray,
+    to_output: np.ndarray,
+    added: np.ndarray,
+    at_ends: np.ndarray,
     equations: Sequence[int],
     acting: Sequence[tuple[Matrix, ...] | None],
     halves: Matrix,

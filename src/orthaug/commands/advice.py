@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
@@ -28,6 +28,10 @@ from orthaug.data.steps import Shift
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.reports.result import FitResult
+
+if TYPE_CHECKING:
+    from orthaug.fitting.estimates import Estimate
+
 
 _TERMS = 3  # suspected terms that are proposed
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
@@ -59,7 +63,7 @@ class Proposal:
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
 
 
-def proposals(job: Job, result: FitResult, fit: Any) -> list[Proposal]:
+def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
     """Return what the findings of a fit suggest, the likeliest first, each once."""
     if (
         result.residuals is not None
@@ -382,7 +386,7 @@ class Trials:
     settled: dict[str, Any]
     """What the fit has chosen, as a change of the spec: a search would cost most."""
 
-    def changed_job(self, change: dict[str, Any]) -> Job:
+    def changed_job(self, change: dict[str, object]) -> Job:
         """Return the job of a changed spec, with what the fit has chosen.
 
         Raises:
@@ -432,7 +436,7 @@ class Trials:
         return ProposalErrors(proposal, pieces, physics_only)
 
 
-def apply_change(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+def apply_change(declaration: dict[str, object], change: dict[str, Any]) -> dict[str, Any]:
     """Return a declaration with the values of a change; dots in a key separate its levels."""
     found = deepcopy(declaration)
     for key, value in change.items():
@@ -447,7 +451,7 @@ def apply_change(declaration: dict[str, Any], change: dict[str, Any]) -> dict[st
 
 
 def advise(
-    job: Job, fit: Any, result: FitResult
+    job: Job, fit: Estimate, result: FitResult
 ) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
     """Return the changes that lower the free run's validation error, and a count of all trials.
 

@@ -17,6 +17,7 @@ from orthaug.selection.parts import CONDITIONAL, Parts, of_parts, split_record
 if TYPE_CHECKING:
     from orthaug.commands.job import Job
     from orthaug.commands.spec import Spec
+    from orthaug.fitting.estimates import Estimate
 
 _CONDITIONAL = (
     "no standard errors and no intervals: the terms were chosen on some of these rows "
@@ -119,7 +120,7 @@ def split_rows(job: Job, parts: Parts) -> tuple[Rows, Rows]:
     return Rows(whole.files, first), Rows(whole.files, second)
 
 
-def intervals_of(job: Any, fit: Any) -> Intervals | None:
+def intervals_of(job: Job, fit: Estimate) -> Intervals | None:
     """Return where the intervals of a fit come from whose terms were chosen.
 
     None where the spec says no such.
@@ -134,7 +135,7 @@ def intervals_of(job: Any, fit: Any) -> Intervals | None:
     return of_parts(job.problem.count)
 
 
-def after_choice(job: Any, fit: Any) -> tuple[Any, Intervals | None]:
+def after_choice(job: Job, fit: Estimate) -> tuple[Any, Intervals | None]:
     """Return a fit and the source of its intervals; without them if its rows chose its terms."""
     found = intervals_of(job, fit) if fit.status.ok else None
     if found is None or found.source != "none":

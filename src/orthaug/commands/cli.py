@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -445,7 +445,7 @@ def _silent(line: str) -> None:
     """Show nothing: the file is read too quickly for a message."""
 
 
-def _ask(text: str, check: Callable[[str], Any], default: str | None = "") -> str:
+def _ask(text: str, check: Callable[[str], object], default: str | None = "") -> str:
     """Return an answer that `check` accepts.
 
     Another answer is refused with the reason, and the question is repeated.

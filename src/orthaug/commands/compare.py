@@ -184,7 +184,7 @@ def _saved_row(name: str, model: Model, job: Job) -> RowResult:
 
 
 def row_of(
-    name: str, model: Model, scores: Any, warnings: Sequence[Any], **content: Any
+    name: str, model: Model, scores: Any, warnings: Sequence[object], **content: object
 ) -> RowResult:
     """Return a row of the table; keys that `content` lacks are null."""
     own = {"name": name, "weights": model.form.bound.size}

@@ -62,7 +62,7 @@ class PartSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _files_alone(cls, given: Any) -> Any:
+    def _files_alone(cls, given: object) -> Any:
         """Read a file's name, or a list of names, as the table that has nothing else."""
         if isinstance(given, str | list):
             given = {"files": given}

@@ -252,7 +252,7 @@ def simulated_job(
     return pose_job(job.path, job.spec, job.physics, parts)
 
 
-def outcome_of(plan: Plan, seed: int, draw: int, *, choices: bool) -> dict[str, Any]:
+def outcome_of(plan: Plan, seed: int, draw: int, *, choices: bool) -> dict[str, object]:
     """Return what a draw gives: the declared fit and, if asked, every other choice."""
     number = draw % len(plan.terms)
     planted = plan.terms[number][1]
@@ -304,7 +304,7 @@ def _is_doubted(name: str, warnings: Sequence[Any]) -> bool:
     )
 
 
-def _values(job: Job, fit: Any) -> dict[str, Any]:
+def _values(job: Job, fit: Any) -> dict[str, object]:
     """Return the parameters of a fit, physical ones of a map included."""
     intervals = fit.interval
     found = {}

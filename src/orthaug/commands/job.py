@@ -130,7 +130,7 @@ class JobPhysics(ABC, Generic[P, F]):
         return None
 
     @abstractmethod
-    def train(self, problem: P, **options: Any) -> F:
+    def train(self, problem: P, **options: object) -> F:
         """Train a problem."""
 
     @property
@@ -144,7 +144,7 @@ class JobPhysics(ABC, Generic[P, F]):
     ) -> tuple[Callable[[Record], P], Callable[..., F]]:
         """Return functions that pose a variant on a fold, and train it."""
 
-    def runner(self, engine: Engine) -> Any:
+    def runner(self, engine: Engine) -> Threads:
         """Return the runner of independent runs."""
         return Threads()
 
@@ -167,7 +167,7 @@ class JobPhysics(ABC, Generic[P, F]):
         """Return the free run by the model's physics without its learner."""
 
     @abstractmethod
-    def design(self, job: Job, asked: dict[str, Any], noise: float | None) -> Design:
+    def design(self, job: Job, asked: Mapping[str, object], noise: float | None) -> Design:
         """Return the input that a spec asks for."""
 
     @abstractmethod
@@ -216,7 +216,7 @@ class JobPhysics(ABC, Generic[P, F]):
         """Return the holds of the inputs between samples that could be tried instead."""
         return ()
 
-    def settled(self, fit: F) -> dict[str, Any]:
+    def settled(self, fit: F) -> dict[str, object]:
         """Return the values of a spec that a fit has chosen, as a change of the spec."""
         return {}
 
@@ -320,7 +320,7 @@ class Job:
         return replace(self, spec=spec, physics=physics, problem=problem, checkpoints=None)
 
     @property
-    def runner(self) -> Any:
+    def runner(self) -> Threads | Engine:
         """Runner of the independent runs of this job."""
         return self.physics.runner(self.engine)
 
@@ -435,7 +435,7 @@ class Job:
             or None,
         )
 
-    def training_options(self, variant: Variant) -> dict[str, Any]:
+    def training_options(self, variant: Variant) -> dict[str, object]:
         """Return the options of training of a variant."""
         from orthaug.fitting.setup import FOLD_ITERATIONS
 
@@ -470,7 +470,10 @@ class Job:
 
 
 def _fit_fold(
-    fold: Record, posed: Callable[[Record], P], train: Callable[..., F], options: dict[str, Any]
+    fold: Record,
+    posed: Callable[[Record], P],
+    train: Callable[..., F],
+    options: Mapping[str, object],
 ) -> F:
     """Return the fit to a fold; a function of the module, so that it can be sent to a process."""
     return train(posed(fold), **options)
@@ -547,14 +550,14 @@ def declared_output(job: Job, name: str) -> dict[str, Any]:
     return {"expression": own} if isinstance(own, str) else dict(own)
 
 
-def toml_of(declaration: Mapping[str, Any]) -> str:
+def toml_of(declaration: Mapping[str, object]) -> str:
     """Return the text of a spec that was read."""
     import tomlkit
 
     return tomlkit.dumps(_without_none(declaration))
 
 
-def _without_none(content: Any) -> Any:
+def _without_none(content: object) -> Any:
     """Return the content without keys that are None: TOML has no null."""
     if isinstance(content, dict):
         return {key: _without_none(value) for key, value in content.items() if value is not None}

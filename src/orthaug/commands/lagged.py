@@ -110,7 +110,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
         if any(_is_same(term, expression, place) for term in terms):
             return None
         output = {"output": place} if several else {}
-        change: dict[str, Any] = {
+        change: dict[str, object] = {
             "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **output}]
         }
         if spec.physics is not None:
@@ -174,7 +174,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
         layout, _ = regressor_of(self.baseline, self.lags, self.learner_inputs, *channels)
         return largest_lag(layout), 0
 
-    def pose(self, spec: Spec, record: Record, **options: Any) -> Problem:
+    def pose(self, spec: Spec, record: Record, **options: object) -> Problem:
         return self._posing(spec)(record, **options)
 
     def _posing(self, spec: Spec) -> Callable[..., Problem]:
@@ -221,7 +221,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
     def check_record(self, problem: Problem, record: Record) -> None:
         check_defined(problem, record)
 
-    def train(self, problem: Problem, **options: Any) -> LaggedEstimate:
+    def train(self, problem: Problem, **options: object) -> LaggedEstimate:
         return _train(problem, **options)
 
     def fold_training(
@@ -234,7 +234,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
         physics = replace(self, lags=None, learner_inputs=None) if variant.physics_only else self
         return physics._posing(job.spec), _train
 
-    def runner(self, engine: Engine) -> Any:
+    def runner(self, engine: Engine) -> Engine:
         from orthaug.models.tasks import runs_on
 
         return runs_on(engine)
@@ -304,34 +304,34 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
 
         return LaggedSystem(fit, self.map)
 
-    def _bias(self, evidence: Evidence) -> list[dict[str, Any]]:
+    def _bias(self, evidence: Evidence) -> list[dict[str, object]]:
         """Return the table of suspects before training, under the spec's measure."""
         assert self.weighed is not None
         return bias_before(evidence, self.weighed)
 
 
-def _is_same(term: Mapping[str, Any], expression: str, place: str | None) -> bool:
+def _is_same(term: Mapping[str, object], expression: str, place: str | None) -> bool:
     """Return whether a term of a spec is an expression of the same output."""
     one, other = ("".join(str(text).split()) for text in (term["regressor"], expression))
     return one == other and (place is None or term.get("output") in (None, place))
 
 
-def _pose(record: Record, posed: Any, **options: Any) -> Problem:
+def _pose(record: Record, posed: Any, **options: object) -> Problem:
     return pose(record, *posed, **options)
 
 
-def _train(problem: Problem, **options: Any) -> LaggedEstimate:
+def _train(problem: Problem, **options: object) -> LaggedEstimate:
     from orthaug.fitting.estimation import fit
 
     return fit(problem, **options)
 
 
-def _delayed(job: Job, name: str, late: int) -> dict[str, Any]:
+def _delayed(job: Job, name: str, late: int) -> dict[str, object]:
     """Return the change of a spec in which all lags of an input are larger by `late`."""
     declaration = job.declaration
     read = re.compile(rf"(?<![\w.]){re.escape(name)}\[k(?:-(\d+))?\]")
 
-    def later(text: Any) -> Any:
+    def later(text: object) -> Any:
         if not isinstance(text, str):
             return text
         return read.sub(lambda found: f"{name}[k-{int(found[1] or 0) + late}]", text)
@@ -339,7 +339,7 @@ def _delayed(job: Job, name: str, late: int) -> dict[str, Any]:
     terms = [
         {**term, "regressor": later(term["regressor"])} for term in declaration["baseline"]["terms"]
     ]
-    change: dict[str, Any] = {"baseline.terms": terms}
+    change: dict[str, object] = {"baseline.terms": terms}
     if "inputs" in declaration.get("learner", {}):
         change["learner.inputs"] = [later(text) for text in declaration["learner"]["inputs"]]
     if "suspects" in declaration:

@@ -231,7 +231,7 @@ class FitFacts:
     training: TrainingSection = field(default_factory=lambda: TrainingSection(fallback=False))
     selection: SelectionSection = field(default_factory=SelectionSection)
 
-    def model_dump(self, **_: Any) -> dict[str, Any]:
+    def model_dump(self, **_: object) -> dict[str, object]:
         """Return the declarations that a title is made of."""
         record = self.fit.problem.record
         return {

@@ -70,7 +70,7 @@ class PlainCommand(typer.core.TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         write = formatter.write_dl
 
-        def write_plain(rows: Sequence[tuple[str, str]], *args: Any, **options: Any) -> None:
+        def write_plain(rows: Sequence[tuple[str, str]], *args: object, **options: object) -> None:
             write([(_TYPE.sub("", name), text) for name, text in rows], *args, **options)
 
         formatter.write_dl = write_plain
@@ -163,7 +163,7 @@ _SHORT = 100  # characters of the first line of a command's help: none is cut
 
 
 class _App(typer.Typer):
-    def command(self, *args: Any, **options: Any) -> Any:
+    def command(self, *args: Any, **options: object) -> Any:
         """Register a command, whose help is plain."""
         return super().command(*args, **{"cls": PlainCommand} | options)
 
@@ -405,7 +405,7 @@ def other_writes() -> bool:
     return text is not None
 
 
-def arguments(command: str, *read: Path, **options: Any) -> tuple[str, ...]:
+def arguments(command: str, *read: Path, **options: object) -> tuple[str, ...]:
     """Return the arguments of a command, to run it again: the options that were given, by name.
 
     Examples:

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -140,11 +139,11 @@ def _study(plan: Plan, asked: Asked, share: tuple[int, int] = (0, 1)) -> Study:
 
     def one_draw(
         fingerprint: str, seed: int, share: float | None, terms: str, compared: int, draw: int
-    ) -> Mapping[str, Any]:
+    ) -> Mapping[str, object]:
         with one_core():
             return {"outcome": json.dumps(outcome_of(plan, seed, draw, choices=draw < compared))}
 
-    cases: dict[str, Sequence[Any]] = {
+    cases: dict[str, Sequence[object]] = {
         "fingerprint": [plan.job.fingerprint],
         "seed": [asked.seed],
         "share": [asked.share],
@@ -178,7 +177,7 @@ def _make_draws(
     if missing:
         report_plan(lacking, every)
 
-    def report(*_: Any) -> None:
+    def report(*_: object) -> None:
         if progress is not None:
             progress(sum(place.is_file() for place in places), asked.draws)
 

@@ -315,7 +315,7 @@ def prepared_notes(model: Model, record: Record | None = None, what: str = _RAW)
     return (f"{named} The same was done to these data{here}.{trends}",)
 
 
-def read_initial(initial: str | None, opened: ModelOnData) -> str | Any:
+def read_initial(initial: str | None, opened: ModelOnData) -> str | object:
     """Return the `initial` of `Model.simulate`.
 
     It is "measured" where the data have outputs, "zero" otherwise, or the rows of a CSV.

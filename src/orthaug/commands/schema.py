@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from orthaug._base.content import Content
 from orthaug.reports.benchmark import BenchmarkResult
@@ -34,7 +33,7 @@ RESULTS: dict[str, type[Content]] = {
 """Contents of results by command, and of an error of any command with `--json`."""
 
 
-def schema_of(command: str) -> dict[str, Any]:
+def schema_of(command: str) -> dict[str, object]:
     """Return the JSON schema of what a command writes."""
     return RESULTS[command].model_json_schema(mode="serialization")
 
@@ -46,7 +45,7 @@ def keys_of_a_spec() -> str:
     return re.sub("<!--.*-->\n", "", page.read_text(encoding="utf-8")).rstrip()
 
 
-def schema_of_a_spec() -> dict[str, Any]:
+def schema_of_a_spec() -> dict[str, object]:
     """Return the JSON schema of a spec: keys, types, limits and defaults."""
     from orthaug.commands.spec import Spec
 

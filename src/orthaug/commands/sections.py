@@ -137,7 +137,7 @@ def _in_file(annotation: Any) -> Any:
     return Annotated[float, Field(allow_inf_nan=False)] if annotation is float else annotation
 
 
-def _thaw(value: Any) -> Any:
+def _thaw(value: object) -> Any:
     """Return a value with tuples as lists, as files hold them."""
     if isinstance(value, tuple | list):
         return [_thaw(item) for item in value]
@@ -146,7 +146,9 @@ def _thaw(value: Any) -> Any:
     )
 
 
-def first_message(error: ValidationError, content: dict[str, Any], model: type[BaseModel]) -> str:
+def first_message(
+    error: ValidationError, content: dict[str, object], model: type[BaseModel]
+) -> str:
     """Return the first error as `key: found …; expected …`."""
     errors = error.errors()
     # every branch of a union has errors: the branch whose type fits was meant, and there the
@@ -191,7 +193,7 @@ def _list_example(error: Any, model: type[BaseModel]) -> str:
     return f", such as {name} = {_file_text([error['input']])}"
 
 
-def values_by_key(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def values_by_key(value: object, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield every value of a spec with its key, such as `baseline.terms[0].regressor`."""
     if isinstance(value, Mapping):
         for key, own in value.items():
@@ -203,7 +205,7 @@ def values_by_key(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _file_text(value: Any) -> str:
+def _file_text(value: object) -> str:
     """Return a value as the file writes it, cut where it is long."""
     try:
         text = (
@@ -230,7 +232,7 @@ def _plain(message: str) -> str:
     return "a table" if "dictionary" in message else message
 
 
-def _key(location: tuple[Any, ...], content: Any) -> str:
+def _key(location: tuple[Any, ...], content: object) -> str:
     """Return the key's path in the file, without pydantic's names of union branches."""
     text = ""
     for i, part in enumerate(location):
@@ -243,13 +245,13 @@ def _key(location: tuple[Any, ...], content: Any) -> str:
     return text
 
 
-def _known_keys(parents: list[Any], model: Any) -> list[str]:
+def _known_keys(parents: Sequence[object], model: Any) -> list[str]:
     """Return the keys of the section at a path such as ["data", "tests", "steps"]."""
     section = _section_at(parents, model)
     return [] if section is None else list(section.model_fields)
 
 
-def _section_at(parents: list[Any], model: Any) -> type[BaseModel] | None:
+def _section_at(parents: Sequence[object], model: Any) -> type[BaseModel] | None:
     """Return the section at a path; None where there is none."""
     for part in parents:
         if isinstance(part, int) or not isinstance(model, type):

@@ -203,7 +203,7 @@ def _result(job: Job, selection: Selection, seconds: float) -> SelectResult:
     return SelectResult.model_validate(content)
 
 
-def _shift_entry(shift: Shift) -> dict[str, Any]:
+def _shift_entry(shift: Shift) -> dict[str, object]:
     own = {
         "parameter": shift.parameter,
         "unit": shift.unit,
@@ -219,7 +219,7 @@ def _shift_entry(shift: Shift) -> dict[str, Any]:
     return own | values
 
 
-def _learner_section(learner: Learner | None) -> dict[str, Any] | None:
+def _learner_section(learner: Learner | None) -> dict[str, object] | None:
     """Return the section [learner] of a choice."""
     if learner is None:
         return None

@@ -17,7 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import threading
@@ -47,10 +47,10 @@ class SignalWatch:
     def __init__(self) -> None:
         self.active = self.ending = False
         self._during: Callable[[], str] = _no_text
-        self._stop: Callable[[], Any] = _no_text
+        self._stop: Callable[[], object] = _no_text
         self._then = ""
         self._asked: threading.Event | None = None
-        self.rescue: Callable[[], Any] = _no_text
+        self.rescue: Callable[[], object] = _no_text
         """Writes what is finished already, before a signal ends the program."""
 
     def start(self) -> None:
@@ -72,7 +72,7 @@ class SignalWatch:
 
     @contextmanager
     def report_stop(
-        self, during: Callable[[], str], stop: Callable[[], Any] = _no_text, then: str = ""
+        self, during: Callable[[], str], stop: Callable[[], object] = _no_text, then: str = ""
     ) -> Iterator[None]:
         """Say what a signal stopped and how to go on, `then`, and stop drawing before that."""
         self._during, self._stop, self._then = during, stop, then

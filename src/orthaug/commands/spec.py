@@ -364,7 +364,7 @@ class Spec(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _move_source(cls, content: Any) -> Any:
+    def _move_source(cls, content: dict[str, object]) -> dict[str, object]:
         return with_source_in_motion(content)
 
     @model_validator(mode="after")

@@ -19,7 +19,7 @@ def system_of(text: str) -> System:
         InputError: an unknown kind or key, and what the system refuses.
     """
     kind, *options = text.split(",")
-    keys: dict[str, Any] = {}
+    keys: dict[str, object] = {}
     for option in options:
         name, found, value = (part.strip() for part in option.partition("="))
         if not found or not name:

@@ -112,7 +112,7 @@ class Expression:
             self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
         )
 
-    def evaluate(self, columns: Mapping[Lag, Any], xp: Any) -> Any:
+    def evaluate(self, columns: Mapping[Lag, object], xp: Any) -> Any:
         """Return the value for `columns[lag]`, computed by `xp` (numpy or jax.numpy).
 
         The columns are scalars or arrays of one shape.
@@ -220,7 +220,7 @@ def parse(text: str, constants: Mapping[str, float] | None = None) -> Expression
 
 
 def parse_named(
-    text: Any, known: Mapping[str, float], where: str, hints: Mapping[str, str] | None = None
+    text: object, known: Mapping[str, float], where: str, hints: Mapping[str, str] | None = None
 ) -> Expression:
     """Read `text` as arithmetic on the names in `known`, without channels at a lag.
 
@@ -394,7 +394,11 @@ def _lag(node: ast.Subscript, text: str) -> Lag:
 
 
 def _evaluate(
-    node: ast.expr, columns: Mapping[Lag, Any], constants: Mapping[str, float], xp: Any, text: str
+    node: ast.expr,
+    columns: Mapping[Lag, object],
+    constants: Mapping[str, float],
+    xp: Any,
+    text: str,
 ) -> Any:
     if isinstance(node, ast.Constant):
         return float(node.value)  # type: ignore[arg-type]  (checked by `parse`)

@@ -137,7 +137,7 @@ def in_seconds(values: Vector, header: str) -> Vector:
     return values / round(1 / unit) if unit < 1 else values * unit  # 20 ms are the double 0.02
 
 
-def parse_dates(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
+def parse_dates(cells: Sequence[object] | np.ndarray, where: str) -> Vector | None:
     """Return dates as seconds since the first of them, NaN where a cell is none.
 
     None where they are no dates.
@@ -167,7 +167,7 @@ def parse_dates(cells: Sequence[Any] | np.ndarray, where: str) -> Vector | None:
     return None if parsed is None else _since_first(parsed.reindex(found.index))
 
 
-def _plain(cell: Any) -> Any:
+def _plain(cell: object) -> Any:
     """Return a time of the day as a duration; anything else as it is."""
     if not isinstance(cell, datetime.time):
         return cell

@@ -558,7 +558,7 @@ def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]], t
     header, titles = ahead[at]
     names = ["" if cell is None else str(cell).strip() for cell in titles]
     places = place(names)
-    cells: list[list[Any]] = [[] for _ in places]
+    cells: list[list[object]] = [[] for _ in places]
     for _, row in chain(ahead[at + 1 :], rows):
         for column, index in zip(cells, places, strict=True):
             column.append(row[index] if index < len(row) else None)
@@ -566,7 +566,7 @@ def _pick(path: Path, sheet: Any, place: Place) -> tuple[int, list[list[Any]], t
     return (header + 1, [column[1:] for column in cells], units) if units else (header, cells, ())
 
 
-def as_number(value: Any) -> float:
+def as_number(value: object) -> float:
     """Return a cell as a float, NaN where it holds none; dates are none."""
     if isinstance(value, str):
         return text_number(value)

@@ -305,7 +305,7 @@ class _Account:
         return Preparation(self.kind, _options_of(self.step), self.marked + self.filled)
 
 
-def _options_of(step: Any) -> dict[str, Any]:
+def _options_of(step: Any) -> dict[str, object]:
     """Return the fields of a step that have values."""
     found = {name: getattr(step, name) for name in type(step).__dataclass_fields__}
     plain = {

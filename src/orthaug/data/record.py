@@ -133,7 +133,7 @@ class Channel:
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-def _quote(name: Any) -> str:
+def _quote(name: object) -> str:
     return f"'{name}'" if isinstance(name, str) else show(name)
 
 
@@ -142,7 +142,7 @@ def _counted(name: str, lost: Mapping[str, int]) -> str:
     return f"{name} ({lost[name]} missing)" if lost[name] else name
 
 
-def as_channels(given: Any, what: str) -> tuple[Channel, ...]:
+def as_channels(given: object, what: str) -> tuple[Channel, ...]:
     """Return the channels of names or `Channel`s.
 
     Raises:
@@ -317,7 +317,7 @@ class Record(NotebookView):
         outputs: Sequence[str | Channel] | None = None,
         source: str = "",
         missing: str = "error",
-        time: Any = None,
+        time: object = None,
     ) -> Record:
         """Return one experiment from arrays.
 

@@ -151,7 +151,7 @@ class Span:
             tuple(bare), tuple(future for own in held for future in own), tuple(map(len, held))
         )
 
-    def on(self, *held: Any) -> Span:
+    def on(self, *held: object) -> Span:
         """Return the span with the rows, on the worker that holds them."""
         ends = np.cumsum(self.counts).tolist()
         there = (

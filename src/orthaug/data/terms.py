@@ -20,6 +20,7 @@ from jaxtyping import Int
 
 from orthaug._base.checks import nearest
 from orthaug._base.errors import InputError
+from orthaug._base.jax import ArrayModule
 
 OF_SIGNALS = {
     "abs": "abs({})",
@@ -169,7 +170,7 @@ class TermLibrary:
         return self.pick(i for i in range(len(self)) if i not in gone) if gone else self
 
 
-def products_of(factors: Any, numbers: Any, xp: Any) -> Any:
+def products_of(factors: Any, numbers: Any, xp: ArrayModule) -> Any:
     """Return the terms (K, …) of factors (nf, …) by their factors' numbers (K, order).
 
     Number nf is 1.

@@ -217,7 +217,7 @@ class _Datasets:
     matlab: bool
     held: dict[str, FileVariable]
 
-    def add(self, name: str, item: Any) -> None:
+    def add(self, name: str, item: object) -> None:
         """Note the contents of a path of groups; `#refs#` is reached by its references only."""
         if not name.startswith("#"):
             self._note(name, item, 0)
@@ -269,7 +269,7 @@ class _Datasets:
                 self._note(name if cell and count == 1 else place, self.file[reference], depth + 1)
 
 
-def _word(text: Any) -> str:
+def _word(text: object) -> str:
     return text.decode("latin-1") if isinstance(text, bytes) else str(text)
 
 
@@ -311,7 +311,9 @@ def short(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
-def _lazy(path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], Any]) -> FileVariable:
+def _lazy(
+    path: Path, shape: Sequence[int], itemsize: int, read: Callable[[], object]
+) -> FileVariable:
     what = "×".join(map(str, shape)) or "a scalar"
 
     def read_checked() -> Any:

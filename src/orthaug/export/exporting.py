@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from orthaug import __version__
-from orthaug._base.checks import check_type, nearest
+from orthaug._base.checks import Vector, check_type, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.folders import check_replaceable, whole_folder
-from orthaug._base.jax import jax
+from orthaug._base.jax import Array, jax
 from orthaug.export import written_back
 from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
@@ -208,7 +208,7 @@ def _list_signals(head: str, signals: Sequence[Signal]) -> str:
     return "\n".join([head, "", *(lines or ["- none"]), ""])
 
 
-def _vectors_of(model: Any, program: Program) -> Vectors:
+def _vectors_of(model: Model, program: Program) -> Vectors:
     """Return a free run under random levels of the inputs.
 
     The levels are in the range that the model was trained on, where that is known.
@@ -224,8 +224,8 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
         drawn if program.ends == 1 else np.concatenate([drawn, np.roll(drawn, -1, axis=0)], axis=1)
     )
 
-    def run(state: Any, rows: Any) -> Any:
-        def one(state: Any, row: Any) -> Any:
+    def run(state: Array, rows: Array) -> Any:
+        def one(state: Array, row: Array) -> Any:
             following, y = model.step(state, row)
             return following, (state, y)
 
@@ -240,7 +240,7 @@ def _vectors_of(model: Any, program: Program) -> Vectors:
     return max(found, key=lambda vectors: len(vectors.outputs))  # the first of equal ones
 
 
-def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
+def _starts(model: Model, program: Program) -> Iterator[np.ndarray]:
     """Return initial states: within and in the middle of the learner's features, zero, one."""
     zero, numbers = np.zeros(len(program.states)), model.numbers
     names = [entry.text.partition("[")[0] for entry in model.form.entries]
@@ -256,7 +256,7 @@ def _starts(model: Any, program: Program) -> Iterator[np.ndarray]:
     yield zero + 1
 
 
-def _range(model: Any, program: Program) -> tuple[Any, Any]:
+def _range(model: Model, program: Program) -> tuple[Vector, Vector]:
     """Return middle and half width of each input in the learner's features; 0 and 1 elsewhere."""
     middle, reach = np.zeros(program.held), np.ones(program.held)
     entries = model.form.entries

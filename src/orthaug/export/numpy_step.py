@@ -189,7 +189,7 @@ def _advance_function(
 
 
 def _exponential(
-    rate: Callable[[Vector, Vector], Vector], m: dict[str, Any]
+    rate: Callable[[Vector, Vector], Vector], m: dict[str, object]
 ) -> Callable[..., Vector]:
     def rest(x: Vector, u: Vector) -> Vector:
         return rate(x, u) - m["linear"] @ x

@@ -70,7 +70,7 @@ class _Graph:
                 "install onnx."
             ) from None
         self.onnx, self.program = onnx, program
-        self.nodes: list[Any] = []
+        self.nodes: list[object] = []
         self.tables: dict[str, np.ndarray] = {}
         self.constants = {constant.name: constant.value for constant in program.constants}
 
@@ -103,7 +103,7 @@ class _Graph:
         self.onnx.checker.check_model(model)
         return model.SerializeToString()
 
-    def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: Any) -> str:
+    def add(self, operator: str, *inputs: str, out: str | None = None, **attributes: object) -> str:
         """Add a node and return its result."""
         out = out or f"n{len(self.nodes)}"
         self.nodes.append(self.onnx.helper.make_node(operator, list(inputs), [out], **attributes))

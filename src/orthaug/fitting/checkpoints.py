@@ -139,7 +139,7 @@ class RunCheckpoint:
             return None
         return state
 
-    def keep(self, state: Any, *, ended: bool = False) -> None:
+    def keep(self, state: object, *, ended: bool = False) -> None:
         """Write the state, or the result of a call that makes it, if due or if the run `ended`.
 
         A full disk leaves the one before.

@@ -546,7 +546,7 @@ def _kept_gain(model: Model[MotionDynamics]) -> InnovationsModel | None:
     return noise if isinstance(noise, InnovationsModel) and not noise.white else None
 
 
-def _pad_segments(part: Any, segmented: SegmentedMotion) -> Any:
+def _pad_segments(part: np.ndarray, segmented: SegmentedMotion) -> np.ndarray:
     """Return an array (…, m) of an earlier version, which padded a single segment with none."""
     width = np.shape(segmented.segments.start)[-1]
     if part is None or np.shape(part)[-1] >= width:

@@ -44,6 +44,9 @@ from orthaug.physics.projection import Projection
 if TYPE_CHECKING:
     import pandas as pd
 
+    from orthaug.physics.baseline import Parameter
+    from orthaug.physics.parameters import PhysicalParameter
+
 STD_KINDS = {
     "plain": "for white errors of constant variance",
     "hc3": "robust (HC3), for errors of varying size",
@@ -341,7 +344,7 @@ class Estimate(FitView):
         table = parameter_frame(self.coordinates.parameters, self.values, self.std, self.interval)
         return table.assign(**self._more_columns())
 
-    def _more_columns(self) -> dict[str, Any]:
+    def _more_columns(self) -> dict[str, object]:
         """Return further columns of `parameters`."""
         return {}
 
@@ -493,7 +496,10 @@ def left_out(experiments: int) -> float:
 
 
 def parameter_frame(
-    parameters: Sequence[Any], values: Vector, std: Vector | None, ci: Matrix | None
+    parameters: Sequence[Parameter | PhysicalParameter],
+    values: Vector,
+    std: Vector | None,
+    ci: Matrix | None,
 ) -> pd.DataFrame:
     """Return a table with a row per parameter: unit, initial, value, std, 95 % interval.
 
@@ -519,7 +525,7 @@ def parameter_frame(
 
 
 def parameter_lines(
-    parameters: Sequence[Any],
+    parameters: Sequence[Parameter | PhysicalParameter],
     values: Vector,
     std: Vector | None,
     ci: Matrix | None,

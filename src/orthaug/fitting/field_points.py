@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, positive
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import Array, jax, jnp, quick_jit
+from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
 from orthaug.fitting.segments import Segments
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.splitting import Field, beyond_data, rest_of
@@ -107,15 +107,15 @@ def _sum_over(
     numbers: Numbers,
     state: Float[Array, "n0 m"],
     inputs: Float[Array, "T nu m"],
-    scored: Any,
+    scored: Array,
     q: Float[Array, "np"],
     size: Float[Array, "nl"],
 ) -> Float[Array, "np n0+n m"]:
     numbers = form.prepare(numbers)
     c, w = numbers.c, numbers.weights
 
-    def mixed_derivative(x: Any, row: Any) -> Any:
-        def half(q: Any, x: Any) -> Any:
+    def mixed_derivative(x: AnyArray, row: Any) -> Array:
+        def half(q: Array, x: Array) -> Any:
             u = form.inputs_at(numbers, x, row)
             return jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2) / 2
 

@@ -550,7 +550,7 @@ def check_types(**given: Any) -> None:
         check_type(value, kind, name, words)
 
 
-def check_regularizations(given: Any, choices: Sequence[Any], chosen: bool) -> bool:
+def check_regularizations(given: object, choices: Sequence[object], chosen: bool) -> bool:
     """Return whether "auto" was given, and check the regularizations.
 
     Raise InputError for what is none, or for several that nothing chooses between.

@@ -71,7 +71,7 @@ Key = tuple[str, bool]
 
 
 def choose_focus(
-    problem: PosedProblem, fit: Fit, options: Mapping[str, Any], criterion: Criterion
+    problem: PosedProblem, fit: Fit, options: Mapping[str, object], criterion: Criterion
 ) -> Estimate:
     """Return the best of the estimates one step ahead and on the free run.
 
@@ -160,7 +160,7 @@ def _on_half(problem: PosedProblem, fit: Fit, options: Mapping[str, Any]) -> tup
         return None, None
 
 
-def _quick(options: Mapping[str, Any], solver: Solver) -> dict[str, Any]:
+def _quick(options: Mapping[str, object], solver: Solver) -> dict[str, object]:
     """Return options for a quick fit to a part of the rows, by another solver."""
     own = {name: value for name, value in options.items() if name != "progress"}
     return {**quick_options(own), "solver": solver, "fallback": False, "checkpoints": None}

@@ -68,7 +68,7 @@ SOLVERS = Registry(
 )
 
 
-def declared_by_name(registry: Registry, given: Any) -> Any:
+def declared_by_name(registry: Registry, given: object) -> Any:
     """Return a declaration, of a name that of its kind with the defaults.
 
     Raises:

@@ -88,7 +88,7 @@ def fit_coloured(
     problem: Problem,
     noise: ARMA,
     fit: Callable[..., LaggedEstimate],
-    options: Mapping[str, Any],
+    options: Mapping[str, object],
 ) -> LaggedEstimate:
     """Return the fit with a noise model; white where `noise` chooses none.
 

@@ -94,7 +94,7 @@ class OneStep:
 def one_pass(
     criterion: Callable[..., Normal],
     w: Float[Array, "nw"],
-    arguments: tuple[Any, ...],
+    arguments: tuple[object, ...],
     overlap: Overlap,
 ) -> Normal:
     """Return the criterion at w.
@@ -107,7 +107,7 @@ def one_pass(
 def linearise(
     criterion: Callable[..., Normal],
     w: Float[Array, "nw"],
-    arguments: tuple[Any, ...],
+    arguments: tuple[object, ...],
     overlap: Overlap,
 ) -> Normal:
     """Return the criterion at w, in two passes: the second subtracts the overlap of the first."""

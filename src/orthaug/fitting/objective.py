@@ -133,7 +133,7 @@ class FreeRunObjective:
 
     def _try(
         self, c: Vector, w: Vector, start: Start, follows: bool
-    ) -> tuple[float, Any, Any, Matrix | None]:
+    ) -> tuple[float, np.ndarray, np.ndarray | None, np.ndarray | None]:
         """Return `‖r‖²`, states, errors and their squares from the start's states.
 
         Or from states that follow (c, w).
@@ -158,12 +158,16 @@ class FreeRunObjective:
         start = Start(point.states, point.misfit, np.concatenate([point.c, point.w]), **following)
         return LinearisedFreeRun(information, gradient, information, start)
 
-    def values_of(self, point: TrialPoint) -> tuple[Any, ...]:
+    def values_of(
+        self, point: TrialPoint
+    ) -> tuple[np.ndarray, np.ndarray, float, float, np.ndarray]:
         """Return the values from which `trial_of` makes the trial, bit by bit."""
         squares = np.zeros((0, 0)) if point.squares is None else point.squares
         return point.p, np.asarray(point.states), point.misfit, point.loss, squares
 
-    def trial_of(self, kept: tuple[Any, ...]) -> TrialPoint:
+    def trial_of(
+        self, kept: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    ) -> TrialPoint:
         """Return the trial of values that `values_of` returned."""
         p, states, misfit, loss, squares = kept
         theta, c, w = self.place(p)

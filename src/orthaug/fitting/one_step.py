@@ -264,7 +264,11 @@ class OneStepTask(TrainingRows):
         hold = Hold(matrix, target / self.rms)
         ridge, evidence = ridge_of(regularization)
         if solver.gauss_newton and not structure.from_initial:
-            options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "progress": progress}
+            options: dict[str, object] = {
+                "ridge": ridge,
+                "evidence": evidence,
+                "progress": progress,
+            }
             options["noticeable"] = noticeable_fall(
                 structure, elimination.decoupled, self.problem.samples
             )

@@ -109,7 +109,7 @@ def check_no_memory(learner: Learner | None) -> None:
 
 
 def choose_regularizations(
-    given: Any,
+    given: object,
     solver: Solver,
     criterion: Criterion,
     structure: Structure,

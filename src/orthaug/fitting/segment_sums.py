@@ -58,7 +58,9 @@ class TrialSquares:
     dynamics: Dynamics
     moves: bool
 
-    def __call__(self, chunk: Any, numbers: Numbers, weight: Any, rows: Any, step: Any) -> Squares:
+    def __call__(
+        self, chunk: Any, numbers: Numbers, weight: AnyArray, rows: Any, step: AnyArray
+    ) -> Squares:
         segments, start = chunk
         states = start.moved(step) if self.moves else start
         errors = _errors(self.dynamics, numbers, segments, states)
@@ -78,7 +80,7 @@ class SegmentEquations:
     free: bool
 
     def __call__(
-        self, chunk: Any, numbers: Numbers, weight: Any, rows: Any
+        self, chunk: tuple[Segments, AnyArray], numbers: Numbers, weight: AnyArray, rows: AnyArray
     ) -> tuple[Any, tuple[Any, Any]]:
         segments, states = chunk
         numbers = self.dynamics.prepare(numbers)
@@ -95,7 +97,7 @@ class SegmentEquations:
 class MovedStates:
     """The states of a chunk after a step of (c, w); this adds nothing to a sum."""
 
-    def __call__(self, best: Best, step: Any) -> tuple[Any, Any]:
+    def __call__(self, best: Best, step: AnyArray) -> tuple[Any, Any]:
         return best.moved(step), ()
 
 
@@ -142,7 +144,7 @@ class SegmentSums:
                 known = self.placed[id(segments)] = (segments, there)
             return known[1]
 
-    def with_states(self, segments: Any, states: Any) -> Any:
+    def with_states(self, segments: Any, states: AnyArray) -> Any:
         """Return the segments beside their states (k, n0, m)."""
         rows = self.rows(segments)
         return self.engine.beside(rows, self.engine.place(np.asarray(states), rows))
@@ -190,7 +192,7 @@ class SegmentSums:
         numbers: Numbers,
         segments: Any,
         initial: InitialStates,
-        states: Any,
+        states: AnyArray,
         *made: Matrix,
     ) -> tuple[Matrix, Vector, Any]:
         """Return the normal equations of (c, w) with the states at their best, and `Best`.

@@ -216,7 +216,7 @@ class SegmentedMotion(SegmentedProblem):
             states.append(settle(*made)[0])
         return np.stack(states)
 
-    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+    def mean_square(self, c: Vector, w: Any, tilt: object = None) -> float:
         """Return the mean of squared errors over whole experiments.
 
         Outputs in their deviations.
@@ -244,7 +244,7 @@ class SegmentedMotion(SegmentedProblem):
         x, inputs = self.steps(c, w, states)
         return x, self.dynamics.at_samples(self.numbers(c, w), x, inputs)
 
-    def steps(self, c: Vector, w: Any, states: Any) -> tuple[Matrix, Matrix]:
+    def steps(self, c: Vector, w: Any, states: np.ndarray) -> tuple[Matrix, Matrix]:
         """Return states (N, nx) of the segments' runs and inputs of their steps, on scored rows."""
         scored = np.moveaxis(np.asarray(self.segments.scored), -1, 1)
         inputs = np.moveaxis(np.asarray(self.segments.inputs), -1, 1)[scored]
@@ -305,7 +305,7 @@ def _states(
     numbers = form.prepare(numbers)
     side_by_side = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
 
-    def one_chunk(chunk: Any) -> Array:
+    def one_chunk(chunk: tuple[Array, Array]) -> Array:
         return jax.lax.scan(lambda state, row: (side_by_side(state, row), state), *chunk)[1]
 
     return jax.lax.map(one_chunk, (states, segments.inputs))

@@ -219,7 +219,7 @@ class SegmentedProblem:
         return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
 
     def _checkpoint(
-        self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, Any]
+        self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, object]
     ) -> RunCheckpoint | None:
         """Return the checkpoint of a descent from this start."""
         if self.checkpoints is None:
@@ -252,7 +252,7 @@ class SegmentedProblem:
         used = (objective.physics + end.effective) / ny
         return noise_covariance(squares, self.observations - used)
 
-    def mean_square(self, c: Vector, w: Vector, tilt: Any = None) -> float:
+    def mean_square(self, c: Vector, w: Vector, tilt: object = None) -> float:
         """Return the mean of squared errors over whole experiments.
 
         Outputs in their deviations.

@@ -283,7 +283,7 @@ class Part:
     def of(cls, span: Span, rows: Any) -> Part:
         return cls(span, np.asarray(rows), span.held)
 
-    def on(self, *held: Any) -> Part:
+    def on(self, *held: object) -> Part:
         """Return the part where the rows are."""
         return Part(self.span.on(*held), self.rows)
 

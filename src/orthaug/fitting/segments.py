@@ -202,7 +202,7 @@ def sensitivity(
     numbers = dynamics.prepare(numbers)
     n = dynamics.unknowns
 
-    def one_chunk(total: Array, chunk: tuple[Any, ...]) -> tuple[Any, Any]:
+    def one_chunk(total: Array, chunk: tuple[AnyArray, ...]) -> tuple[Any, Any]:
         shared, own = chunk_sensitivity(dynamics, numbers, chunk, weight)
         return total + shared, own
 
@@ -217,7 +217,7 @@ def sensitivity_once(dynamics: Dynamics, *given: Any) -> Sensitivity:
 
 
 def chunk_sensitivity(
-    dynamics: Dynamics, numbers: Numbers, chunk: tuple[Any, ...], weight: Any
+    dynamics: Dynamics, numbers: Numbers, chunk: tuple[AnyArray, ...], weight: Any
 ) -> Sensitivity:
     """Return the Gram matrices of one chunk (states, inputs, target, scored)."""
     state, *rows = chunk
@@ -262,7 +262,7 @@ def _step_by_step(
         state, slopes, value, slope = dynamics.tangents(numbers, state, slopes, inputs)
         return (state, slopes), _columns(scored, slope, target, value, weight)
 
-    def block(carry: tuple[Any, ...], rows: tuple[Any, ...]) -> tuple[Any, None]:
+    def block(carry: tuple[Any, ...], rows: tuple[object, ...]) -> tuple[Any, None]:
         *running, shared, own = carry
         running, columns = jax.lax.scan(step, tuple(running), rows)
         columns = jnp.moveaxis(columns, 0, -2)  # (ny, n0 + n + 1, size, width)
@@ -318,7 +318,7 @@ def _steps_at_once(
         own_slopes = jnp.pad(to_unknowns, ((0, 0), (n0, 0), (0, 0), (0, 0)))
         by_step = (jnp.moveaxis(part[:n0], -2, 0) for part in (to_state, own_slopes))
 
-        def follow(slopes: Array, row: Any) -> tuple[Any, Any]:
+        def follow(slopes: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
             to_state, beside = row
             return sum(to_state[:, i, None] * slopes[None, i] for i in range(n0)) + beside, slopes
 
@@ -368,7 +368,7 @@ def block_scores(
             sums.at[block].add(jnp.sum(columns[:, :-1] * columns[:, -1:], axis=0)),
         ), None
 
-    def one_chunk(chunk: tuple[Any, ...]) -> Array:
+    def one_chunk(chunk: tuple[AnyArray, ...]) -> Array:
         state, *rows = chunk
         start = (state, dynamics.first_slopes(width), jnp.zeros((blocks, n0 + n, width)))
         return jax.lax.scan(step, start, (*rows, place))[0][2]

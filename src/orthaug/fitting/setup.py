@@ -27,7 +27,7 @@ class TrainingSetup:
 
     @classmethod
     def of(
-        cls, train: Callable[..., Any], problem: Any, options: Mapping[str, Any]
+        cls, train: Callable[..., object], problem: Any, options: Mapping[str, object]
     ) -> TrainingSetup:
         """Return the setup of a fit, without the options that belong to one run."""
         kept = {name: value for name, value in options.items() if name not in _OF_ONE_RUN}
@@ -79,13 +79,13 @@ class TrainingSetup:
             _fit_fold, pose=problem.poser, train=self.train, options=quick_options(options)
         )
 
-    def _options(self, **changes: Any) -> dict[str, Any]:
+    def _options(self, **changes: object) -> dict[str, Any]:
         """Return the options with changes; an ensemble is of full fits only."""
         changes |= {"ensemble": False} if "ensemble" in self.options else {}
         return {**self.options, **changes}
 
 
-def quick_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def quick_options(options: Mapping[str, Any]) -> dict[str, object]:
     """Return the options of a fit to a part of the rows: one start, few iterations, no choice."""
     given = options["regularization"]
     return {
@@ -99,7 +99,10 @@ def quick_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _fit_fold(
-    fold: Record, pose: Callable[[Record], Any], train: Callable[..., Any], options: dict[str, Any]
+    fold: Record,
+    pose: Callable[[Record], object],
+    train: Callable[..., object],
+    options: Mapping[str, object],
 ) -> Any:
     """Return the fit to a fold; a function of the module, so that it can be sent to a process."""
     return train(pose(fold), **options)

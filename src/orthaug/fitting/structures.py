@@ -193,7 +193,7 @@ class BaselinePenalty(_SolvedTheta):
         )
 
 
-def with_measure(structure: Any, measure: Measure) -> Any:
+def with_measure(structure: Any, measure: Measure) -> Structure:
     """Return a structure under a measure, where it splits θ."""
     takes = any(field.name == "measure" for field in fields(structure))
     return replace(structure, measure=measure) if takes else structure

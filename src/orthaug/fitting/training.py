@@ -310,7 +310,7 @@ def _run(
     return made + again, runs + list(more)
 
 
-def _conclude_briefly(task: Task, structure: Structure, run: Any) -> Any:
+def _conclude_briefly(task: Task, structure: Structure, run: object) -> Estimate:
     return task.conclude(structure, task.learned(run), briefly=True)
 
 

@@ -119,7 +119,7 @@ class TrainingRows:
         total = self.engine.sum(Blocks(self.bound), self.rows, w, self._no_overlap)
         return np.asarray(total[:nt, nt + 1 :]) * self.rms
 
-    def _weights(self, learned: TrainedLearner) -> tuple[Any, Any]:
+    def _weights(self, learned: TrainedLearner) -> tuple[np.ndarray, np.ndarray | None]:
         """Return weights and tilt of a learned function, the tilt in the rows' coordinates."""
         if learned.tilt is None:
             return learned.weights, None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.special
@@ -86,7 +85,7 @@ def standardise(signal: Pieces) -> list[Vector] | None:
     return None if norm <= CONSTANT * np.sqrt(len(whole)) else split_like(whole / norm, parts)
 
 
-def split_like(whole: np.ndarray, like: Sequence[Vector]) -> list[Any]:
+def split_like(whole: np.ndarray, like: Sequence[Vector]) -> list[np.ndarray]:
     """Return a signal in experiments as long as those of another."""
     return np.split(whole, np.cumsum([len(one) for one in like])[:-1])
 

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.jax import Array, jax, jnp, quick_jit
+from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
 from orthaug.data.sources import Partition
 from orthaug.inference.measures import Measure, Points, Support, weigh
 from orthaug.models.dynamics import Numbers
@@ -466,14 +466,21 @@ def split_motion(
     )
 
 
-def _learned_rows(form: MotionDynamics, q: Any, x: Any, u: Any) -> Any:
+def _learned_rows(form: MotionDynamics, q: AnyArray, x: Array, u: Array) -> Array:
     """Return the physics of the learned equations and outputs (nl,) at one point."""
     return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
 
 
 def rest_of(
-    form: MotionDynamics, numbers: Numbers, q: Any, c: Any, w: Any, x: Any, u: Any, size: Any
-) -> Any:
+    form: MotionDynamics,
+    numbers: Numbers,
+    q: AnyArray,
+    c: AnyArray,
+    w: AnyArray,
+    x: Array,
+    u: Array,
+    size: Array | float,
+) -> Array:
     """Return (G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
     return (
@@ -521,8 +528,8 @@ def _sum_over(
 
 @partial(quick_jit, static_argnames="form")
 def _square(
-    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
-) -> Any:
+    form: MotionDynamics, numbers: Numbers, q: Array, x: Array, u: Array, weight: Array, size: Array
+) -> Array:
     c, w = numbers.c, numbers.weights
     rest = jax.vmap(lambda x, u: rest_of(form, numbers, q, c, w, x, u, size))(x, u)
     return jnp.sum(jnp.where(weight[:, None] > 0, weight[:, None] * rest**2, 0.0)) / 2
@@ -530,12 +537,12 @@ def _square(
 
 @partial(quick_jit, static_argnames="form")
 def _gauss_newton(
-    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
-) -> Any:
+    form: MotionDynamics, numbers: Numbers, q: Array, x: Array, u: Array, weight: Array, size: Array
+) -> tuple[Array, Array]:
     c, w = numbers.c, numbers.weights
 
-    def one(x: Any, u: Any) -> Any:
-        def rest(q: Any) -> Any:
+    def one(x: Array, u: Array) -> Any:
+        def rest(q: AnyArray) -> Any:
             return rest_of(form, numbers, q, c, w, x, u, size)
 
         return rest(q), jax.jacfwd(rest)(q)
@@ -548,16 +555,16 @@ def _gauss_newton(
 
 @partial(quick_jit, static_argnames="form")
 def _second(
-    form: MotionDynamics, numbers: Numbers, q: Any, x: Any, u: Any, weight: Any, size: Any
-) -> Any:
+    form: MotionDynamics, numbers: Numbers, q: Array, x: Array, u: Array, weight: Array, size: Array
+) -> tuple[Array, ...]:
     """Return the second derivatives of half the distance: in q, in q and c, in q and w.
 
     And what the rest is made of.
     """
     c, w = numbers.c, numbers.weights
 
-    def one(x: Any, u: Any) -> Any:
-        def half(q: Any, c: Any, w: Any) -> Any:
+    def one(x: Array, u: Array) -> Any:
+        def half(q: Array, c: Array, w: Array) -> Any:
             return jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2) / 2
 
         downhill = jax.grad(half)

@@ -12,12 +12,12 @@ from __future__ import annotations
 import atexit
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,10 +26,22 @@ from orthaug import __version__
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax
-from orthaug._base.parallel import Threads
-from orthaug.data.sources import Source
-from orthaug.models.rows import CHUNK_ROWS, Chunk, Room, build_chunk, chunk_shape, join_chunks
-from orthaug.models.streaming import RowArrays, chunks_of, fold_rows, split_chunks, sum_rows
+from orthaug._base.parallel import Item, Result, Threads
+from orthaug.data.sources import Partition, Source
+from orthaug.models.rows import (
+    CHUNK_ROWS,
+    Chunk,
+    Kept,
+    Room,
+    RowArrays,
+    build_chunk,
+    chunk_shape,
+    join_chunks,
+)
+from orthaug.models.streaming import chunks_of, fold_rows, split_chunks, sum_rows
+
+if TYPE_CHECKING:
+    from distributed import Future
 
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -48,10 +60,10 @@ class ClusterChunks:
     `counts` are the chunks of each group.
     """
 
-    futures: list[Any]
+    futures: Sequence[Future | tuple[Future, ...]]
     counts: tuple[int, ...]
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[Future | tuple[Future, ...]]:
         return iter(self.futures)
 
 
@@ -67,8 +79,8 @@ class Dask(Threads):
     resident: bool = False
 
     def build_rows(
-        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
-    ) -> list[Any]:
+        self, z: Matrix, q: np.ndarray, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> list[Future]:
         """Send rows that are in memory here to the workers."""
         workers = self.shares
         shape = chunk_shape(len(z), min(self.limit, -(-len(z) // workers)))
@@ -78,14 +90,18 @@ class Dask(Threads):
             groups = [chunks[i : i + each] for i in range(0, len(chunks), each)]
             return [self.client.submit(keep_on_worker, group, pure=False) for group in groups]
 
-    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> list[Any]:
+    def draw(
+        self, source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]
+    ) -> list[Future]:
         """Return the partitions of a source, built where they will be summed."""
         with cluster_errors():
             # Not scattered: what is lost can be made again
             task = partial(_build_chunks, row_builder=row_builder, size=self.limit)
             return [self._task_on(task, partition) for partition in source.partitions]
 
-    def sum(self, function: Callable[..., Any], rows: Sequence[Any], *arguments: Any) -> Any:
+    def sum(
+        self, function: Callable[..., Result], rows: Sequence[object], *arguments: object
+    ) -> Result:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
             return self._add_sums(
@@ -95,7 +111,7 @@ class Dask(Threads):
                 ]
             )
 
-    def _add_sums(self, parts: list[Any]) -> Any:
+    def _add_sums(self, parts: list[Future]) -> Any:
         """Return the sum of partial sums, in their order."""
         while len(parts) > 1:
             groups = [parts[i : i + _BRANCHES] for i in range(0, len(parts), _BRANCHES)]
@@ -106,7 +122,7 @@ class Dask(Threads):
     def shares(self) -> int:
         return max(len(self.client.nthreads()), 1)
 
-    def place(self, chunks: Any, like: Sequence[Any] | None = None) -> ClusterChunks:
+    def place(self, chunks: object, like: object = None) -> ClusterChunks:
         pieces = split_chunks(chunks)
         each = -(-len(pieces) // min(self.shares, len(pieces)))
         whole, rest = divmod(len(pieces), each)
@@ -124,7 +140,10 @@ class Dask(Threads):
             )
 
     def read(
-        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+        self,
+        function: Callable[[Item], Iterable[object]],
+        partitions: Sequence[Item],
+        counts: Sequence[int],
     ) -> ClusterChunks:
         with cluster_errors():
             return ClusterChunks(
@@ -136,8 +155,8 @@ class Dask(Threads):
             )
 
     def along(
-        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
-    ) -> Any:
+        self, function: Callable[[Any, Result], Result], partitions: Sequence[Any], carry: Result
+    ) -> Result:
         with cluster_errors():
             for partition in partitions:
                 held = getattr(partition, "held", ())
@@ -149,8 +168,11 @@ class Dask(Threads):
         return ClusterChunks(list(zip(*rows, strict=True)), rows[0].counts)
 
     def keep(
-        self, function: Callable[..., Any], rows: ClusterChunks, *arguments: Any
-    ) -> tuple[ClusterChunks, Any]:
+        self,
+        function: Callable[..., tuple[object, Result]],
+        rows: ClusterChunks,
+        *arguments: object,
+    ) -> tuple[ClusterChunks, Result]:
         given = jax.tree.map(np.asarray, arguments)
         with cluster_errors():
             both = [
@@ -168,7 +190,9 @@ class Dask(Threads):
                 [chunk for group in self.client.gather(list(rows)) for chunk in group]
             )
 
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+    def passes(
+        self, function: Callable[[Item], Result], partitions: Sequence[Item]
+    ) -> list[Result]:
         """Return a function of every partition, where the workers are."""
         with cluster_errors():
             return self.client.gather(
@@ -179,7 +203,7 @@ class Dask(Threads):
         """Return the room of the smallest worker, which may add up a whole branch of the tree."""
         return smallest_worker(self.client, _BRANCHES + 1)
 
-    def _task_on(self, function: Callable[[Any], Any], partition: Any) -> Any:
+    def _task_on(self, function: Callable[[Any], object], partition: Any) -> Future:
         """Return a task; rows that the cluster holds already go to it by their futures."""
         held = getattr(partition, "held", ())
         if not held:
@@ -190,25 +214,27 @@ class Dask(Threads):
 
 
 def _build_chunks(
-    partition: Any, row_builder: Callable[[Any], Iterator[RowArrays]], size: int
+    partition: Partition, row_builder: Callable[[Partition], Iterator[RowArrays]], size: int
 ) -> list[Chunk]:
     """Return the chunks of a partition."""
     return list(chunks_of(row_builder(partition), chunk_shape(partition.rows, size)[1]))
 
 
-def _where_held(function: Callable[[Any], Any], partition: Any, *held: Any) -> Any:
+def _where_held(function: Callable[[Any], Result], partition: Any, *held: object) -> Result:
     return function(partition.on(*held))
 
 
-def _chunk_list(function: Callable[[Any], Any], partition: Any) -> list[Any]:
+def _chunk_list(function: Callable[[Item], Iterable[Result]], partition: Item) -> list[Result]:
     return list(function(partition))
 
 
-def _carry_on(function: Callable[[Any, Any], Any], partition: Any, carry: Any, *held: Any) -> Any:
+def _carry_on(
+    function: Callable[[Any, Result], Result], partition: Any, carry: Result, *held: object
+) -> Result:
     return function(partition.on(*held) if held else partition, carry)
 
 
-def keep_on_worker(value: Any) -> Any:
+def keep_on_worker(value: Result) -> Result:
     """Return the value that a worker keeps.
 
     The scheduler makes it again where that worker is lost.
@@ -216,7 +242,7 @@ def keep_on_worker(value: Any) -> Any:
     return value
 
 
-def _pair_chunks(groups: Any) -> list[Any]:
+def _pair_chunks(groups: Any) -> list[object]:
     """Return the chunks of a group; of a tuple of groups, tuples of their chunks."""
     return (
         list(zip(*map(_pair_chunks, groups), strict=True)) if isinstance(groups, tuple) else groups
@@ -224,20 +250,22 @@ def _pair_chunks(groups: Any) -> list[Any]:
 
 
 def _fold_partition(
-    function: Callable[..., Any], chunks: Sequence[Any], arguments: tuple[Any, ...]
-) -> tuple[list[Any], Any]:
+    function: Callable[..., tuple[Kept, Result]],
+    chunks: Sequence[object],
+    arguments: tuple[object, ...],
+) -> tuple[list[Kept], Result]:
     """Return the part of a partition that is kept, and its share of a sum."""
     return fold_rows(function, _pair_chunks(chunks), arguments)
 
 
 def _partial_sum(
-    function: Callable[..., Any], chunks: Sequence[Chunk], arguments: tuple[Any, ...]
-) -> Any:
+    function: Callable[..., Result], chunks: Sequence[object], arguments: tuple[object, ...]
+) -> Result:
     """Return one partition's share of a sum, as NumPy arrays."""
     return jax.tree.map(np.asarray, sum_rows(function, _pair_chunks(chunks), arguments))
 
 
-def _add_parts(parts: Sequence[Any]) -> Any:
+def _add_parts(parts: Sequence[Result]) -> Result:
     total = parts[0]
     for part in parts[1:]:
         total = jax.tree.map(np.add, total, part)

@@ -7,7 +7,7 @@ each makes its own shards.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -16,14 +16,16 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
-from orthaug._base.jax import jax
+from orthaug._base.jax import AnyArray, Array, jax
 from orthaug._base.memory import available
-from orthaug._base.parallel import Heard, nobody
+from orthaug._base.parallel import Given, Heard, Item, Result, nobody
+from orthaug.data.sources import Partition, Source
 from orthaug.models.rows import (
     CHUNK_ROWS,
     Chunk,
     LocalEngine,
     Room,
+    RowArrays,
     all_chunks,
     build_chunk,
     chunk_shape,
@@ -50,47 +52,61 @@ class Devices(LocalEngine):
     limit: int = CHUNK_ROWS
     resident: bool = False
 
-    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+    def build_rows(
+        self, z: Matrix, q: np.ndarray, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> Chunk:
         # Of the chunks of one share
         count, size = chunk_shape(-(-len(z) // self.shares), self.limit)
         return self.place(build_chunk(z, q, e, gain, (count * self.shares, size)))
 
-    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+    def draw(
+        self, source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]
+    ) -> Chunk:
         return self.build_rows(*read_all_rows(source, row_builder))
 
-    def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
+    def sum(self, function: Callable[..., Result], rows: Chunk, *arguments: object) -> Result:
         return self._run(function, rows, arguments, keeps=False)[1]
 
     @property
     def shares(self) -> int:
         return _mesh(self.count)[1]
 
-    def place(self, chunks: Any, like: Any = None) -> Any:
+    def place(self, chunks: Result, like: object = None) -> Result:
         sharding = jax.sharding.NamedSharding(
             _mesh(self.count)[0], jax.sharding.PartitionSpec(_ROWS)
         )
 
-        def shard(values: Any) -> Any:
+        def shard(values: AnyArray) -> Array:
             held = np.asarray(values)
             return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
 
         return jax.tree.map(shard, chunks)
 
     def read(
-        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+        self,
+        function: Callable[[Item], Iterable[object]],
+        partitions: Sequence[Item],
+        counts: Sequence[int],
     ) -> Any:
-        def pad_shares(part: Any) -> Any:
+        def pad_shares(part: np.ndarray) -> np.ndarray:
             return np.concatenate(
                 [part, np.zeros((-len(part) % self.shares, *part.shape[1:]), part.dtype)]
             )
 
         return self.place(jax.tree.map(pad_shares, all_chunks(function, partitions)))
 
-    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+    def keep(
+        self, function: Callable[..., tuple[object, Result]], rows: Any, *arguments: object
+    ) -> tuple[Any, Result]:
         return self._run(function, rows, arguments, keeps=True)
 
     def _run(
-        self, function: Any, rows: Any, arguments: tuple[Any, ...], *, keeps: bool
+        self,
+        function: Callable[..., object],
+        rows: Any,
+        arguments: tuple[object, ...],
+        *,
+        keeps: bool,
     ) -> tuple[Any, Any]:
         with _ONE_AT_A_TIME:
             return jax.block_until_ready(
@@ -98,8 +114,12 @@ class Devices(LocalEngine):
             )
 
     def map(
-        self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
-    ) -> Iterator[Any]:
+        self,
+        function: Callable[[Given, Item, Callable[..., None]], Result],
+        given: Given,
+        items: Sequence[Item],
+        heard: Heard = nobody,
+    ) -> Iterator[Result]:
         """Yield the results one after another.
 
         Programs that share devices wait for each other, on all hosts in the same order.
@@ -122,7 +142,7 @@ class Devices(LocalEngine):
 
 
 @cache
-def _mesh(count: int | None) -> tuple[Any, int]:
+def _mesh(count: int | None) -> tuple[jax.sharding.Mesh, int]:
     devices = jax.devices()[:count]
     return jax.sharding.Mesh(np.array(devices), (_ROWS,)), len(devices)
 
@@ -130,15 +150,15 @@ def _mesh(count: int | None) -> tuple[Any, int]:
 @cache
 def _compile_sum(
     function: Callable[..., Any], count: int | None, arguments: int, keeps: bool
-) -> Any:
+) -> Callable[..., Any]:
     """Compile a sum: each device adds up its own chunks, then all of them have the total.
 
     With `keeps` each device also returns what it keeps.
     """
     spec = jax.sharding.PartitionSpec
 
-    def share(chunks: Any, *given: Any) -> Any:
-        def pair(chunk: Any) -> tuple[Any, Any]:
+    def share(chunks: object, *given: object) -> tuple[object, object]:
+        def pair(chunk: object) -> tuple[Any, Any]:
             found = function(chunk, *given)
             return found if keeps else (None, found)
 

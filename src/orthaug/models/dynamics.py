@@ -212,7 +212,7 @@ class Dynamics(Protocol):
         ...
 
     def states_at(
-        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: Any
+        self, numbers: Numbers, outputs: Matrix, inputs: Matrix, rows: np.ndarray
     ) -> Float[np.ndarray, "r n0"]:
         """Return the states of a free run at some rows of an experiment.
 
@@ -294,7 +294,7 @@ class Local(NamedTuple):
     to_unknowns: Any
     """(n0 + ny, n, r)."""
 
-    def along(self, slopes: Any, fused: bool = False) -> tuple[Any, Any, Any, Any]:
+    def along(self, slopes: Any, fused: bool = False) -> tuple[Array, Array, Array, Array]:
         """Return state, slopes, outputs and their slopes as `Dynamics.tangents`, for given slopes.
 
         `fused` sums instead of a matrix product are faster where the slopes are cheap to compute.
@@ -374,11 +374,11 @@ class AutodiffDynamics:
             jnp.eye(n0, n0 + self.unknowns)[..., None], (n0, n0 + self.unknowns, width)
         )
 
-    def local(self: Dynamics, numbers: Numbers, states: Any, inputs: Any) -> Local:
+    def local(self: Dynamics, numbers: Numbers, states: AnyArray, inputs: AnyArray) -> Local:
         """Return steps from r states (n0, r) and inputs (nu, r), each by itself."""
         nt = len(numbers.theta)
 
-        def value_twice(state: Any, unknowns: Any, inputs: Any) -> tuple[Any, Any]:
+        def value_twice(state: Array, unknowns: Array, inputs: Array) -> tuple[Array, Array]:
             own = numbers._replace(theta=unknowns[:nt], weights=unknowns[nt:])
             following, parts = self.step(own, state, inputs)
             value = jnp.concatenate([following, parts.total])
@@ -392,8 +392,8 @@ class AutodiffDynamics:
         return Local(value, *(jnp.where(jnp.isfinite(d), d, 0.0) for d in slopes))
 
     def tangents(
-        self: Any, numbers: Numbers, state: Any, slopes: Any, inputs: Any
-    ) -> tuple[Any, Any, Any, Any]:
+        self: Any, numbers: Numbers, state: AnyArray, slopes: AnyArray, inputs: AnyArray
+    ) -> tuple[Array, Array, Array, Array]:
         """Propagate `S⁺ = A S + [0 B]` with A = ∂x⁺/∂x and B = ∂x⁺/∂(c, w); the output alike."""
         return self.local(numbers, state, inputs).along(slopes)
 

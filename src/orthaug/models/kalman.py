@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import Array, jax, jnp, padded_length
+from orthaug._base.jax import AnyArray, Array, jax, jnp, padded_length
 from orthaug.data.record import Experiment, Record
 from orthaug.models.dynamics import Numbers, Parts
 
@@ -104,7 +104,7 @@ class Filter(Protocol):
         ...
 
     def row(
-        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Any, measured: Any
+        self, numbers: Numbers, noise: Noise, belief: StateEstimate, inputs: Array, measured: Array
     ) -> tuple[StateEstimate, FilterRow]:
         """Return the estimates of a row from its outputs (ny,), and of the next row's state."""
         ...
@@ -117,8 +117,8 @@ def slope(function: Any, at: Array) -> tuple[Any, Any]:
 
 
 def correct(
-    mean: Array, covariance: Array, noise: Any, measured: Array
-) -> tuple[Any, Any, Any, Any, Any]:
+    mean: Array, covariance: Array, noise: AnyArray, measured: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return mean (n + ny,) and covariance of (state, outputs) after a measurement.
 
     `noise` (ny, ny) is the covariance of the measured outputs' noise.
@@ -183,7 +183,7 @@ def _likelihood(
     measured: Array,
 ) -> Array:
     def row(
-        carry: tuple[StateEstimate, Any], given: tuple[Any, Any]
+        carry: tuple[StateEstimate, Array], given: tuple[Array, Array]
     ) -> tuple[tuple[StateEstimate, Any], None]:
         following, estimated = form.row(numbers, noise, carry[0], *given)
         return (following, carry[1] + estimated.log_likelihood), None

@@ -253,7 +253,7 @@ class LaggedDynamics:
         leaves = self.bound.leaves(numbers.weights)
         past = state.reshape(self.memory, len(self.outputs))
 
-        def predict(c: Array, leaves: list[Any], past: Array) -> Array:
+        def predict(c: Array, leaves: Sequence[Array], past: Array) -> Array:
             return self.step(numbers._replace(theta=c, weights=leaves), past.reshape(-1), inputs)[
                 1
             ].total
@@ -280,7 +280,7 @@ def _predict_rows(form: LaggedDynamics, numbers: Numbers, x: Float[Array, "m nx"
     return jax.vmap(lambda row: form.at(numbers, row))(x)
 
 
-def _learned_output(bound: Bound, numbers: Numbers, z: Any, phi: Any) -> Any:
+def _learned_output(bound: Bound, numbers: Numbers, z: Any, phi: AnyArray) -> Any:
     """Return f (ny,) at scaled features z; of an ensemble the median of `f_i + φ tilt_i`."""
     if numbers.tilt is None:
         return numbers.gain * bound.values(numbers.weights, z)

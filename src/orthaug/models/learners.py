@@ -8,7 +8,7 @@ of `Bound` know the tree.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from typing import Annotated, Any, Protocol, runtime_checkable
@@ -497,18 +497,18 @@ class Bound:
         """Return f(z; w) for one row; the weights are one vector or leaves."""
         return self.from_leaves(w if isinstance(w, list) else self.leaves(w), z)
 
-    def from_leaves(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+    def from_leaves(self, leaves: Sequence[AnyArray], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """Return f(z; w) for one row, of the weight arrays."""
         return self.learner.apply(self.tree(leaves), z)
 
-    def one_of_many(self, leaves: list[Any], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
+    def one_of_many(self, leaves: Sequence[Array], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """Return `from_leaves` where thousands of rows are mapped side by side."""
         learner = self.learner
         if isinstance(learner, MLP) and type(learner).apply is MLP.apply:  # no subclass's own
             return learner.apply_to_many(self.tree(leaves), z)
         return self.from_leaves(leaves, z)
 
-    def tree(self, leaves: list[Any]) -> Tree:
+    def tree(self, leaves: Sequence[AnyArray]) -> Tree:
         """Return the learner's own weights, of the weight arrays."""
         return jax.tree.unflatten(self._shape[0], leaves)
 
@@ -521,7 +521,9 @@ class Bound:
         Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
         """
 
-        def one_row(leaves: list[Any], z_row: Array, gain_row: Array) -> tuple[Any, list[Any]]:
+        def one_row(
+            leaves: Sequence[Array], z_row: Array, gain_row: Array
+        ) -> tuple[Any, list[Any]]:
             value, pullback = jax.vjp(lambda tree: self.one_of_many(tree, z_row), leaves)
             scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
             return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]

@@ -65,7 +65,7 @@ class MotionField:
         """Return what a step reads of the inputs, and its length over the sampling time."""
         return split_pace(row, self.motion.hold, self.substeps, len(self.motion.external))
 
-    def external(self, u: Any) -> Any:
+    def external(self, u: AnyArray) -> Any:
         """Return the record's inputs (external,) of all inputs u (nu,) at a point."""
         return u[len(self.motion.held) :]
 

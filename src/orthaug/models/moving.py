@@ -43,9 +43,9 @@ class Slopes(NamedTuple):
     """Value of a map from (x, c, w), and ∂/∂x, ∂/∂c, ∂/∂w."""
 
     value: Any
-    to_x: Any
+    to_x: Array
     to_c: Any
-    to_w: Any
+    to_w: Array
 
 
 def sample_slopes(form: MotionField, numbers: Numbers, state: Array, row: Array) -> Slopes:
@@ -148,7 +148,7 @@ def _differentiate(function: Any, x: Array, c: Any, motion: Motion) -> tuple[Any
     """
     if motion.source is not None:
 
-        def twice(x: Any, c: Any) -> tuple[Any, Any]:
+        def twice(x: Array, c: Array) -> tuple[Array, Array]:
             value = function(x, c)
             return value, value
 
@@ -286,7 +286,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def step(self, numbers: Numbers, state: Array, inputs: Any) -> tuple[Any, Parts]:
         return _step(self, numbers, state, inputs)
 
-    def _step_once(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Parts]:
+    def _step_once(self, numbers: Numbers, state: Array, inputs: Array) -> tuple[Array, Parts]:
         motion, now = self.motion, self.inputs_at(numbers, state, inputs)
         y = self.observed(numbers, state, now)
         following = self._to_next_sample(numbers, state, now, inputs)
@@ -295,7 +295,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             following = motion.after_sample(following, y, state, now, p, jnp)
         return following, Parts(y, jnp.zeros_like(y), jnp.zeros_like(y))
 
-    def _to_next_sample(self, numbers: Numbers, state: Any, now: Any, inputs: Array) -> Any:
+    def _to_next_sample(self, numbers: Numbers, state: Array, now: Array, inputs: Array) -> Any:
         """Return the states one sample later, with what a controller sets held until then."""
         if self.motion.scheme.discrete:
             return sum(self.rates(numbers, state, now))
@@ -319,7 +319,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         if not self.motion.scheme.splits_linear_part:
             return numbers
 
-        def of(theta: Any) -> Any:
+        def of(theta: Array) -> Any:
             return self.exponentials(numbers._replace(theta=theta))
 
         theta = jnp.asarray(numbers.theta)
@@ -344,8 +344,8 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return self.motion.scheme.has_adjoint and few and self.differentiable
 
     def tangents(
-        self, numbers: Numbers, state: Any, slopes: Any, inputs: Any
-    ) -> tuple[Any, Any, Any, Any]:
+        self, numbers: Numbers, state: Array, slopes: Array, inputs: Array
+    ) -> tuple[Array, Array, Array, Array]:
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
     def local(self, numbers: Numbers, states: Array, inputs: Array) -> Local:
@@ -365,17 +365,17 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         value, to_x, *own = (jnp.concatenate(both) for both in zip(following, output, strict=True))
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
-    def _by_scheme(self, numbers: Numbers, state: Any, inputs: Any) -> Any:
+    def _by_scheme(self, numbers: Numbers, state: Array, inputs: Array) -> Array:
         """Return the derivatives of states and outputs by p through the exponentials.
 
         They are (n0 + ny, n, r). A step takes the exponentials as given.
         """
         scheme, by_theta = numbers.scheme
 
-        def next_state(scheme: Any, state: Any, row: Any) -> Any:
+        def next_state(scheme: Exponentials, state: Array, row: Array) -> Array:
             return self.step(numbers._replace(scheme=(scheme, None)), state, row)[0]
 
-        def along(moved: Any) -> Any:
+        def along(moved: Any) -> Array:
             return jax.vmap(
                 lambda x, row: jax.jvp(lambda s: next_state(s, x, row), (scheme,), (moved,))[1],
                 -1,
@@ -388,7 +388,9 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
 
 @partial(jax.jit, static_argnames="form")
-def _step(form: MotionDynamics, numbers: Numbers, state: Array, inputs: Array) -> tuple[Any, Parts]:
+def _step(
+    form: MotionDynamics, numbers: Numbers, state: Array, inputs: Array
+) -> tuple[Array, Parts]:
     """Return a step.
 
     It is traced once, whatever programs contain it; so is the field in it.
@@ -397,5 +399,5 @@ def _step(form: MotionDynamics, numbers: Numbers, state: Array, inputs: Array) -
 
 
 @partial(jax.jit, static_argnames="form")
-def _field(form: MotionDynamics, numbers: Numbers, x: Any, u: Any) -> Any:
+def _field(form: MotionDynamics, numbers: Numbers, x: Array, u: Array) -> Any:
     return sum(form.rates(numbers, x, u))

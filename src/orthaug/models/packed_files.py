@@ -21,7 +21,7 @@ from orthaug._base.errors import InputError
 
 
 def pack(
-    number: int, declared: Mapping[str, Any], arrays: Mapping[str, Any]
+    number: int, declared: Mapping[str, object], arrays: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Any], bytes]:
     """Return the contents of the two files in the format of this `number`."""
     packed = save_arrays(
@@ -33,7 +33,7 @@ def pack(
     return declaration | {"checksum": _checksum(declaration)}, packed
 
 
-def write_packed(packed: tuple[dict[str, Any], bytes], path: Path, arrays: Path) -> None:
+def write_packed(packed: tuple[dict[str, object], bytes], path: Path, arrays: Path) -> None:
     """Write the declaration to `path`, the arrays beside it."""
     arrays.write_bytes(packed[1])
     path.write_text(json.dumps(packed[0], indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -98,6 +98,6 @@ def read_packed(
         raise InputError(f"{arrays}: cannot be read ({error}).") from None
 
 
-def _checksum(declaration: Any) -> str:
+def _checksum(declaration: object) -> str:
     canonical = json.dumps(declaration, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()

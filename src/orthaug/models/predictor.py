@@ -66,7 +66,7 @@ class PredictorDynamics(MotionDynamics):
         missed = _missed(inputs[-ny:], parts.total)
         return following + _times(self.gain(numbers), missed), parts
 
-    def local(self, numbers: Numbers, states: Any, inputs: Any) -> Local:
+    def local(self, numbers: Numbers, states: Array, inputs: Array) -> Local:
         """Return the slopes of the motion's own step, corrected: ∂x⁺ − K ∂ŷ, and e by K."""
         n0, ny = self.states, len(self.outputs)
         value, to_state, to_own = self.plain.local(self._own(numbers), states, inputs[:-ny])
@@ -74,7 +74,7 @@ class PredictorDynamics(MotionDynamics):
         there = jnp.isfinite(measured)
         missed = _missed(measured, value[n0:])
 
-        def corrected(slopes: Any) -> Any:
+        def corrected(slopes: Array) -> Array:
             moved = jnp.where(there[:, None], slopes[n0:], 0.0)
             own = slopes[:n0] - _times(gain, moved)
             return jnp.concatenate([own, slopes[n0:]])

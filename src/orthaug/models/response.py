@@ -6,7 +6,7 @@ Every response carries its horizon.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool
@@ -215,7 +215,7 @@ class Response:
         import pandas as pd
 
         trajectory = self.trajectories[experiment]
-        columns: dict[str, Any] = {
+        columns: dict[str, object] = {
             "time": trajectory.start_time + trajectory.time(self.sampling_time)
         }
         for i, channel in enumerate(self.outputs):

@@ -9,23 +9,27 @@ is a function of one chunk. The function does not know where the rows are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from orthaug._base.checks import Matrix
-from orthaug._base.jax import Array, jax, jnp
-from orthaug._base.parallel import Heard, Threads, in_threads, nobody
+from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import AnyArray, Array, jax, jnp
+from orthaug._base.parallel import Given, Heard, Item, Result, Threads, in_threads, nobody
+from orthaug.data.sources import Partition, Source
 from orthaug.models.dynamics import Numbers
 from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.learners import Bound
 from orthaug.physics.noise import FilterRows, RowFilter
 
 CHUNK_ROWS = 5000  # fastest of 500 … 10000 at 10⁴×81 and 10⁵×257, see benchmarks/
+RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""Features (m, nz), Q (m, ny, nθ), P⊥Y (m, ny) and gain (m, ny, ny) of some rows."""
+Kept = TypeVar("Kept")  # beside a sum
 # Rows: so few take less time than to compile for their number, or for that of a fold
 _FEW, _SHARED = (1024, 512)
 
@@ -94,19 +98,23 @@ class Engine(Protocol):
         """
         ...
 
-    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Any:
+    def build_rows(
+        self, z: Matrix, q: np.ndarray, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> Any:
         """Keep rows (N, …) in the engine's memory."""
         ...
 
-    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Any:
+    def draw(self, source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]) -> Any:
         """Return rows of a `data.sources.Source`, which `row_builder` makes of each partition."""
         ...
 
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+    def passes(
+        self, function: Callable[[Item], Result], partitions: Sequence[Item]
+    ) -> list[Result]:
         """Return `[function(p) for p in partitions]`, where the partitions are read."""
         ...
 
-    def sum(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> Any:
+    def sum(self, function: Callable[..., Result], rows: Any, *arguments: object) -> Result:
         """Return Σ function(chunk, *arguments) over all chunks.
 
         `function` is hashable, its result any pytree of arrays.
@@ -126,14 +134,17 @@ class Engine(Protocol):
         ...
 
     def read(
-        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+        self,
+        function: Callable[[Item], Iterable[object]],
+        partitions: Sequence[Item],
+        counts: Sequence[int],
     ) -> Any:
         """Return rows from the chunks that `function(partition)` yields, `counts` of each."""
         ...
 
     def along(
-        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
-    ) -> Any:
+        self, function: Callable[[Item, Result], Result], partitions: Sequence[Item], carry: Result
+    ) -> Result:
         """Compute `carry = function(partition, carry)` over all partitions in their order."""
         ...
 
@@ -141,7 +152,9 @@ class Engine(Protocol):
         """Return rows whose chunks are tuples of the chunks of others."""
         ...
 
-    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+    def keep(
+        self, function: Callable[..., tuple[object, Result]], rows: Any, *arguments: object
+    ) -> tuple[Any, Result]:
         """Return two results of `function(chunk, *arguments)`: kept rows, and a sum.
 
         The first of each pair stays where it is, the second is summed.
@@ -153,8 +166,12 @@ class Engine(Protocol):
         ...
 
     def map(
-        self, function: Any, given: Any, items: Sequence[Any], heard: Heard = nobody
-    ) -> Iterator[Any]:
+        self,
+        function: Callable[[Given, Item, Callable[..., None]], Result],
+        given: Given,
+        items: Sequence[Item],
+        heard: Heard = nobody,
+    ) -> Iterator[Result]:
         """Yield results of independent runs, `function(given, item, report)`; as `Threads.map`."""
         ...
 
@@ -166,15 +183,17 @@ class Engine(Protocol):
 class LocalEngine(Threads):
     """Engine that reads partitions in this process and keeps the chunks of rows in one array."""
 
-    def passes(self, function: Callable[[Any], Any], partitions: Sequence[Any]) -> list[Any]:
+    def passes(
+        self, function: Callable[[Item], Result], partitions: Sequence[Item]
+    ) -> list[Result]:
         return in_threads(function, partitions)
 
     def along(
-        self, function: Callable[[Any, Any], Any], partitions: Sequence[Any], carry: Any
-    ) -> Any:
+        self, function: Callable[[Item, Result], Result], partitions: Sequence[Item], carry: Result
+    ) -> Result:
         return reduce(lambda carry, partition: function(partition, carry), partitions, carry)
 
-    def beside(self, *rows: Any) -> Any:
+    def beside(self, *rows: Result) -> tuple[Result, ...]:
         return rows
 
     def fetch(self, rows: Any) -> Any:
@@ -188,28 +207,37 @@ class InMemory(LocalEngine):
     limit: int = CHUNK_ROWS
     resident: bool = True
 
-    def build_rows(self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]) -> Chunk:
+    def build_rows(
+        self, z: Matrix, q: np.ndarray, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+    ) -> Chunk:
         return self.place(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Any, row_builder: Callable[[Any], Any]) -> Chunk:
+    def draw(
+        self, source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]
+    ) -> Chunk:
         return self.build_rows(*read_all_rows(source, row_builder))
 
-    def sum(self, function: Callable[..., Any], rows: Chunk, *arguments: Any) -> Any:
+    def sum(self, function: Callable[..., Result], rows: Chunk, *arguments: object) -> Result:
         return _compiled_sum(function, rows, arguments)
 
     @property
     def shares(self) -> int:
         return 1
 
-    def place(self, chunks: Any, like: Any = None) -> Any:
+    def place(self, chunks: Result, like: object = None) -> Result:
         return jax.tree.map(jax.device_put, chunks)
 
     def read(
-        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+        self,
+        function: Callable[[Item], Iterable[object]],
+        partitions: Sequence[Item],
+        counts: Sequence[int],
     ) -> Any:
         return self.place(all_chunks(function, partitions))
 
-    def keep(self, function: Callable[..., Any], rows: Any, *arguments: Any) -> tuple[Any, Any]:
+    def keep(
+        self, function: Callable[..., tuple[object, Result]], rows: Any, *arguments: object
+    ) -> tuple[Any, Result]:
         return _compiled_fold(function, rows, arguments)
 
     def room(self) -> Room | None:
@@ -218,33 +246,37 @@ class InMemory(LocalEngine):
 
 @partial(jax.jit, static_argnames="function")
 def _compiled_fold(
-    function: Callable[..., Any], rows: Any, arguments: tuple[Any, ...]
-) -> tuple[Any, Any]:
+    function: Callable[..., tuple[Kept, Result]], rows: Any, arguments: tuple[object, ...]
+) -> tuple[Kept, Result]:
     return row_fold(lambda chunk: function(chunk, *arguments), rows)
 
 
 @partial(jax.jit, static_argnames="function")
-def _compiled_sum(function: Callable[..., Any], rows: Chunk, arguments: tuple[Any, ...]) -> Any:
+def _compiled_sum(
+    function: Callable[..., Result], rows: Chunk, arguments: tuple[object, ...]
+) -> Result:
     return row_sum(lambda chunk: function(chunk, *arguments), rows)
 
 
-def all_chunks(function: Callable[[Any], Any], partitions: Sequence[Any]) -> Any:
+def all_chunks(function: Callable[[Item], Iterable[Result]], partitions: Sequence[Item]) -> Result:
     """Return the chunks that a function makes of every partition, (k, …) each."""
     return join_chunks([chunk for partition in partitions for chunk in function(partition)])
 
 
-def join_chunks(chunks: Sequence[Any]) -> Any:
+def join_chunks(chunks: Sequence[Result]) -> Result:
     """Join chunks of any pytree into one, (k, …) each."""
     return jax.tree.map(lambda *parts: np.stack(parts), *chunks)
 
 
-def read_all_rows(source: Any, row_builder: Callable[[Any], Any]) -> tuple[np.ndarray, ...]:
+def read_all_rows(
+    source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]
+) -> tuple[np.ndarray, ...]:
     """Return all rows of a source: features, Q, P⊥Y and gain, (N, …) each."""
     pieces = [arrays for partition in source.partitions for arrays in row_builder(partition)]
     return tuple(np.concatenate(parts) for parts in zip(*pieces, strict=True))
 
 
-def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
+def row_sum(function: Callable[[Any], Result], rows: object) -> Result:
     """Return Σ function(chunk) over the leading axis of every array in `rows`.
 
     Any pytree in, any pytree out.
@@ -252,13 +284,13 @@ def row_sum(function: Callable[[Any], Any], rows: Any) -> Any:
     return row_fold(lambda chunk: (None, function(chunk)), rows)[1]
 
 
-def row_fold(function: Callable[[Any], tuple[Any, Any]], rows: Any) -> tuple[Any, Any]:
+def row_fold(function: Callable[[Any], tuple[Kept, Result]], rows: object) -> tuple[Kept, Result]:
     """Return the first results of function(chunk), (k, …), and the sum of the second."""
     function = jax.jit(function)  # traced once for its shape and the sum
     first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), rows)
     zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, first)[1])
 
-    def step(total: Any, chunk: Any) -> tuple[Any, Any]:
+    def step(total: Result, chunk: object) -> tuple[Result, Kept]:
         kept, share = function(chunk)
         return jax.tree.map(jnp.add, total, share), kept
 
@@ -291,7 +323,9 @@ def in_chunks(
     return padded
 
 
-def build_chunk(z: Matrix, q: Any, e: Matrix, gain: Any, shape: tuple[int, int]) -> Chunk:
+def build_chunk(
+    z: Matrix, q: np.ndarray, e: Matrix, gain: np.ndarray, shape: tuple[int, int]
+) -> Chunk:
     """Return rows (N, …) as a chunk (k, …, m) of NumPy arrays."""
     padded = in_chunks(z, shape, repeat=True)  # zeros may be where the learner has no value
     pieces: Any = (padded, *(in_chunks(piece, shape) for piece in (q, e, gain)))
@@ -310,7 +344,7 @@ def gram(columns: Float[Array, "n rows"]) -> Float[Array, "n n"]:
 
 
 def filtered_rows(
-    z: Matrix, q: Any, e: Matrix, unit: Any, noise: RowFilter, weight: Matrix
+    z: Matrix, q: np.ndarray, e: Matrix, unit: Vector, noise: RowFilter, weight: Matrix
 ) -> Chunk:
     """Return all rows as one chunk in memory, under a noise model.
 
@@ -372,7 +406,9 @@ class MixedGram:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Array, mix: Array, overlaps: tuple[Any, ...] = ()) -> Array:
+    def __call__(
+        self, chunk: Chunk, w: Array, mix: Array, overlaps: tuple[Array, ...] = ()
+    ) -> Array:
         columns = jnp.concatenate(_columns(self.bound, chunk, w, overlaps))
         return gram(jnp.einsum("oi,nim->nom", mix, columns).reshape(len(columns), -1))
 
@@ -383,11 +419,13 @@ class _LeftOver:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Any, overlaps: tuple[Any, ...]) -> Any:
+    def __call__(self, chunk: Chunk, w: Array, overlaps: tuple[Array, ...]) -> Array:
         return jnp.einsum("tom,wom->tw", *_columns(self.bound, chunk, w, overlaps))
 
 
-def _columns(bound: Bound, chunk: Chunk, w: Array, overlaps: tuple[Any, ...]) -> tuple[Any, Any]:
+def _columns(
+    bound: Bound, chunk: Chunk, w: Array, overlaps: tuple[Array, ...]
+) -> tuple[Array, Array]:
     """Return Q (nt, ny, m) and J (nw, ny, m) of a chunk, J less its overlaps with Q."""
     q = jnp.moveaxis(chunk.q, 1, 0)
     jacobian = chunk.derivatives(bound, w)[1]
@@ -396,12 +434,12 @@ def _columns(bound: Bound, chunk: Chunk, w: Array, overlaps: tuple[Any, ...]) ->
     return q, jacobian
 
 
-def projected_gram(engine: Engine, bound: Bound, w: Any, rows: Any, mix: Any) -> Matrix:
+def projected_gram(engine: Engine, bound: Bound, w: AnyArray, rows: Any, mix: AnyArray) -> Matrix:
     """Return the Gram matrix of `[Q P⊥J]`, outputs multiplied by `mix`.
 
     J is projected twice, so that Q and it are orthogonal.
     """
-    overlaps: tuple[Any, ...] = ()
+    overlaps: tuple[Array, ...] = ()
     for _ in range(2):
         overlaps = (*overlaps, engine.sum(_LeftOver(bound), rows, w, overlaps))
     return np.asarray(engine.sum(MixedGram(bound), rows, w, mix, overlaps))
@@ -439,7 +477,9 @@ class LearnerSums:
 
     bound: Bound
 
-    def __call__(self, chunk: Chunk, w: Array, tilt: Array | None, shift: Array) -> tuple[Any, Any]:
+    def __call__(
+        self, chunk: Chunk, w: Array, tilt: Array | None, shift: Array
+    ) -> tuple[Array, Array]:
         values = _values(self.bound, chunk, w, tilt)
         rest = values - jnp.einsum("otm,t->om", chunk.q, shift)
         return jnp.einsum("otm,om->t", chunk.q, rest), jnp.sum(values**2)

@@ -121,11 +121,11 @@ def _linearise_windows(
     form: Dynamics,
     numbers: Numbers,
     states: Matrix,
-    layout: Any,
+    layout: tuple[Windows, int],
     weight: Matrix,
     begun: Matrix,
     prior: Vector,
-) -> tuple[Any, Any, Any]:
+) -> tuple[np.ndarray, Matrix, Vector]:
     """Return normal matrix (m, n0, n0), right-hand side (m, n0) and misfit (m,).
 
     The misfit is infinite where a run is not finite.
@@ -162,7 +162,7 @@ def _gram(
         following, parts = form.step(numbers, state, row)
         return jnp.concatenate([following, parts.total])
 
-    def step_with_slopes(state: Array, row: Array) -> tuple[Any, Any]:
+    def step_with_slopes(state: Array, row: Array) -> tuple[Array, Array]:
         """Return a step and its slopes (n0 + ny, n0)."""
         along = jax.vmap(
             lambda moved: jax.jvp(lambda x: step_and_output(x, row), (state,), (moved,)),
@@ -192,7 +192,7 @@ def _gram(
             0, steps, lambda i, sums: add(i, sums, *(part[i] for part in every)), sums
         )[1:]
 
-    def advance(i: Array, carry: tuple[Any, ...]) -> tuple[Any, ...]:
+    def advance(i: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
         state, *sums = carry
         value, slope = jax.vmap(step_with_slopes, -1, -1)(state, windows.inputs[i])
         return value[:n0], *add(i, tuple(sums), value, slope)

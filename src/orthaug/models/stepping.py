@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError, show
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout
@@ -80,7 +80,9 @@ class Memory:
         return np.array([column[lag.channel][row - lag.lag] for lag in self.lags], dtype=float)
 
 
-def step_arguments(state: Any, inputs: Any, states: int, count: int) -> tuple[Any, Any]:
+def step_arguments(
+    state: AnyArray, inputs: AnyArray, states: int, count: int
+) -> tuple[Array, Array]:
     """Return a step's arguments as arrays of JAX, which takes wrong lengths in silence.
 
     Raises:

@@ -147,7 +147,7 @@ def load(
         ) from None
 
 
-def _declare(model: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _declare(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the declaration of a model, and its arrays; arrays that are None are left out."""
     kind = next(name for name, physics in _PHYSICS.items() if type(model.form) is physics.form)
     kept, form = model.statistics, model.form
@@ -186,10 +186,10 @@ def _declare(model: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def _rebuild(
     declared: dict[str, Any],
     arrays: dict[str, np.ndarray],
-    given: Any,
+    given: object,
     learner: Learner | None,
     path: Path,
-) -> Any:
+) -> Model:
     """Return the model that a file declares.
 
     Raises:
@@ -280,7 +280,7 @@ def _rebuild_noise(declared: dict[str, Any], arrays: dict[str, np.ndarray]) -> N
     return replace(noise, covariance=arrays.get("noise.covariance"))
 
 
-def _rebuild_baseline(declared: dict[str, Any], given: Any, path: Path) -> Baseline:
+def _rebuild_baseline(declared: dict[str, Any], given: Baseline | None, path: Path) -> Baseline:
     physics = declared["baseline"]
     if physics["kind"] == "terms":
         terms = [Term(**term) for term in physics["terms"]]
@@ -526,7 +526,7 @@ def _rebuild_bound(
     return bound
 
 
-def check_loaded(model: Any, path: Path) -> None:
+def check_loaded(model: Model, path: Path) -> None:
     """Refuse a model whose numbers have other sizes than its form, or are not finite.
 
     Raises:
@@ -572,7 +572,7 @@ def check_loaded(model: Any, path: Path) -> None:
         _check_step(model, path)
 
 
-def _check_step(model: Any, path: Path) -> None:
+def _check_step(model: Model, path: Path) -> None:
     """Trace one step, which computes nothing, to check the shapes.
 
     Expressions, layout and learner must fit the channels and the state.
@@ -586,7 +586,7 @@ def _check_step(model: Any, path: Path) -> None:
         )
 
 
-def _expected_arrays(model: Any) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
+def _expected_arrays(model: Model) -> Iterator[tuple[str, Any, tuple[int, ...] | None]]:
     """Return names, values and shapes of all arrays that a model computes with.
 
     The shape is None where something else has checked it.

@@ -20,11 +20,14 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix
 from orthaug._base.jax import jax
-from orthaug.data.sources import Source, rows_of
+from orthaug._base.parallel import Item, Result
+from orthaug.data.sources import Partition, Source, rows_of
 from orthaug.models.rows import (
     CHUNK_ROWS,
     Chunk,
+    Kept,
     LocalEngine,
+    RowArrays,
     build_chunk,
     chunk_shape,
     join_chunks,
@@ -32,16 +35,13 @@ from orthaug.models.rows import (
 
 _AHEAD = 3  # chunks that wait to be summed
 
-RowArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Features (m, nz), Q (m, ny, nθ), P⊥Y (m, ny) and gain (m, ny, ny) of some rows."""
-
 
 @dataclass(frozen=True, eq=False)
 class SourceRows:
     """Rows of a source: its place, the function that builds them, and the rows in a chunk."""
 
     source: Source
-    row_builder: Callable[[Any], Iterator[RowArrays]]
+    row_builder: Callable[[Partition], Iterator[RowArrays]]
     size: int
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -63,38 +63,48 @@ class Stream(LocalEngine):
     resident: bool = False
 
     def build_rows(
-        self, z: Matrix, q: Any, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
+        self, z: Matrix, q: np.ndarray, e: Matrix, gain: Float[np.ndarray, "N ny ny"]
     ) -> list[Chunk]:
         """Keep rows that are in memory as chunks."""
         return split_chunks(build_chunk(z, q, e, gain, chunk_shape(len(z), self.limit)))
 
-    def draw(self, source: Source, row_builder: Callable[[Any], Iterator[RowArrays]]) -> SourceRows:
+    def draw(
+        self, source: Source, row_builder: Callable[[Partition], Iterator[RowArrays]]
+    ) -> SourceRows:
         return SourceRows(source, row_builder, chunk_shape(rows_of(source), self.limit)[1])
 
-    def sum(self, function: Callable[..., Any], rows: Iterable[Chunk], *arguments: Any) -> Any:
+    def sum(
+        self, function: Callable[..., Result], rows: Iterable[Chunk], *arguments: object
+    ) -> Result:
         return sum_rows(function, rows, arguments)
 
     @property
     def shares(self) -> int:
         return 1
 
-    def place(self, chunks: Any, like: Any = None) -> list[Any]:
+    def place(self, chunks: Result, like: object = None) -> list[Result]:
         return split_chunks(chunks)
 
     def read(
-        self, function: Callable[[Any], Any], partitions: Sequence[Any], counts: Sequence[int]
+        self,
+        function: Callable[[Item], Iterable[object]],
+        partitions: Sequence[Item],
+        counts: Sequence[int],
     ) -> PartitionChunks:
         return PartitionChunks(function, partitions)
 
-    def beside(self, *rows: Iterable[Any]) -> PairedChunks:
+    def beside(self, *rows: Iterable[object]) -> PairedChunks:
         return PairedChunks(rows)
 
     def keep(
-        self, function: Callable[..., Any], rows: Iterable[Any], *arguments: Any
-    ) -> tuple[list[Any], Any]:
+        self,
+        function: Callable[..., tuple[Kept, Result]],
+        rows: Iterable[object],
+        *arguments: object,
+    ) -> tuple[list[Kept], Result]:
         return fold_rows(function, rows, arguments)
 
-    def fetch(self, rows: Iterable[Any]) -> Any:
+    def fetch(self, rows: Iterable[Result]) -> Result:
         return join_chunks(list(rows))
 
     def room(self) -> None:
@@ -105,10 +115,10 @@ class Stream(LocalEngine):
 class PartitionChunks:
     """Chunks of partitions, read at every pass."""
 
-    function: Callable[[Any], Any]
-    partitions: Sequence[Any]
+    function: Callable[[Any], Iterable[object]]
+    partitions: Sequence[object]
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[object]:
         return (chunk for partition in self.partitions for chunk in self.function(partition))
 
 
@@ -116,25 +126,28 @@ class PartitionChunks:
 class PairedChunks:
     """Chunks of several rows, as tuples."""
 
-    rows: tuple[Iterable[Any], ...]
+    rows: tuple[Iterable[object], ...]
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[tuple[object, ...]]:
         return zip(*self.rows, strict=True)
 
 
-def split_chunks(chunks: Any) -> list[Any]:
+def split_chunks(chunks: Result) -> list[Result]:
     """Return the rows of each: the inverse of `join_chunks`."""
     leaves, form = jax.tree.flatten(jax.tree.map(np.asarray, chunks))
     return [jax.tree.unflatten(form, parts) for parts in zip(*leaves, strict=True)]
 
 
 def fold_rows(
-    function: Callable[..., Any], rows: Iterable[Any], arguments: tuple[Any, ...]
-) -> tuple[list[Any], Any]:
+    function: Callable[..., tuple[Kept, Result]],
+    rows: Iterable[object],
+    arguments: tuple[object, ...],
+) -> tuple[list[Kept], Result]:
     """Return the first results of function(chunk, *arguments) on the host, and the second's sum."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, _ = _compile_sum(function)
-    kept, total = [], None
+    kept: list[Kept] = []
+    total: Any = None
     for chunk in read_ahead(rows):
         own, share = jax.tree.map(np.asarray, first(chunk, *arguments))
         kept.append(own)
@@ -143,12 +156,12 @@ def fold_rows(
 
 
 def sum_rows(
-    function: Callable[..., Any], rows: Iterable[Chunk], arguments: tuple[Any, ...]
-) -> Any:
+    function: Callable[..., Result], rows: Iterable[object], arguments: tuple[object, ...]
+) -> Result:
     """Return Σ function(chunk, *arguments), in the order of the rows."""
     arguments = jax.tree.map(jax.numpy.asarray, arguments)
     first, more = _compile_sum(function)
-    total = None
+    total: Any = None
     for chunk in read_ahead(rows):
         total = first(chunk, *arguments) if total is None else more(total, chunk, *arguments)
         jax.block_until_ready(total)  # no more than one waits; memory stays flat
@@ -156,10 +169,10 @@ def sum_rows(
 
 
 @cache
-def _compile_sum(function: Callable[..., Any]) -> tuple[Any, Any]:
+def _compile_sum(function: Callable[..., object]) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Compile the function, and the addition of its result to a sum."""
 
-    def more(total: Any, chunk: Chunk, *arguments: Any) -> Any:
+    def more(total: object, chunk: object, *arguments: object) -> object:
         return jax.tree.map(jax.numpy.add, total, function(chunk, *arguments))
 
     return jax.jit(function), jax.jit(more, donate_argnums=0)
@@ -189,7 +202,7 @@ def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
         yield Chunk(*parts)
 
 
-def read_ahead(items: Iterable[Any], ahead: int = _AHEAD) -> Iterator[Any]:
+def read_ahead(items: Iterable[Result], ahead: int = _AHEAD) -> Iterator[Result]:
     """Yield the items in order, made by a thread of their own while the caller works.
 
     Its errors are raised here.

@@ -14,11 +14,14 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orthaug._base.jax import jax
 from orthaug._base.parallel import (
+    Given,
     Heard,
+    Item,
+    Result,
     RunCancelled,
     iterate_results,
     nobody,
@@ -26,7 +29,10 @@ from orthaug._base.parallel import (
     one_core,
 )
 from orthaug.models.cluster import Dask, cluster_errors, keep_on_worker, smallest_worker
-from orthaug.models.rows import InMemory, Room
+from orthaug.models.rows import Engine, InMemory, Room
+
+if TYPE_CHECKING:
+    from distributed import Future
 
 _MATRICES = 3  # of a run in memory
 _WAIT = 0.5  # s between two looks at whether a run is still wanted, and two reports of a run
@@ -43,18 +49,18 @@ class Tasks(InMemory):
     """
 
     client: Any = None
-    _sent: dict[int, Any] = field(default_factory=dict, compare=False, repr=False)
+    _sent: dict[int, tuple[object, Future]] = field(default_factory=dict, compare=False, repr=False)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
         return InMemory, (self.limit,)  # on a worker
 
     def map(
         self,
-        function: Callable[[Any, Any, Callable[..., None]], Any],
-        given: Any,
-        items: Sequence[Any],
+        function: Callable[[Given, Item, Callable[..., None]], Result],
+        given: Given,
+        items: Sequence[Item],
         heard: Heard = nobody,
-    ) -> Iterator[Any]:
+    ) -> Iterator[Result]:
         """Yield the results of independent runs, as `Threads.map`.
 
         The function, its arguments and results are pickled, `given` once while it is the same.
@@ -62,7 +68,7 @@ class Tasks(InMemory):
         shared = self._share(given)
         with _heard_on(self.client) as (topic, said):
 
-            def one(numbered: tuple[int, Any], check: Callable[[], None]) -> Any:
+            def one(numbered: tuple[int, Item], check: Callable[[], None]) -> Result:
                 i, item = numbered
 
                 def look() -> None:
@@ -86,7 +92,7 @@ class Tasks(InMemory):
         """Return the memory of the smallest worker, which makes whole runs."""
         return smallest_worker(self.client, _MATRICES)
 
-    def _share(self, given: Any) -> Any:
+    def _share(self, given: object) -> Future:
         """Return the reference by which workers know `given`."""
         from dask import config
 
@@ -100,7 +106,7 @@ class Tasks(InMemory):
         return self._sent[id(given)][1]
 
 
-def runs_on(engine: Any) -> Any:
+def runs_on(engine: Engine) -> Engine:
     """Return the engine for several runs over rows in memory: with a cluster they are its tasks."""
     return Tasks(client=engine.client) if isinstance(engine, Dask) else engine
 
@@ -111,8 +117,12 @@ def places(client: Any) -> int:
 
 
 def ask(
-    client: Any, check: Callable[[], None], function: Callable[..., Any], *args: Any, **named: Any
-) -> Any:
+    client: Any,
+    check: Callable[[], None],
+    function: Callable[..., Result],
+    *args: object,
+    **named: object,
+) -> Result:
     """Return the result of a function that a worker computes.
 
     `check` is called now and then, and may raise to give it up.
@@ -133,11 +143,11 @@ def ask(
 
 
 @contextmanager
-def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[Any]]]]:
+def _heard_on(client: Any) -> Iterator[tuple[str, dict[int, deque[tuple[float, ...]]]]]:
     """Yield a topic on which tasks report, and the reports of each task."""
-    topic, said = f"orthaug-{uuid.uuid4().hex}", defaultdict[int, deque[Any]](deque)
+    topic, said = f"orthaug-{uuid.uuid4().hex}", defaultdict[int, deque[tuple[float, ...]]](deque)
 
-    def hear(event: tuple[Any, Any]) -> None:
+    def hear(event: tuple[object, tuple[int, tuple[float, ...]]]) -> None:
         i, what = event[1]
         said[i].append(what)
 
@@ -158,14 +168,14 @@ class DoublePrecision:
 
     value: Any
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
         return _seal, (_Double(), self.value)  # made in this order there
 
 
 class _Double:
     """Switch that turns on double precision where it arrives."""
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
         return _in_double, ()
 
 
@@ -173,7 +183,7 @@ def _in_double() -> None:
     _ = jax.config  # what turns it on
 
 
-def _seal(_: None, value: Any) -> DoublePrecision:
+def _seal(_: None, value: object) -> DoublePrecision:
     return DoublePrecision(value)
 
 
@@ -187,7 +197,7 @@ def _make_run(shared: DoublePrecision, asked: DoublePrecision, topic: str, numbe
 
     worker, key, last = get_worker(), thread_state.key, time.monotonic()
 
-    def report(*what: Any) -> None:
+    def report(*what: float) -> None:
         nonlocal last
         if time.monotonic() - last < _WAIT:
             return

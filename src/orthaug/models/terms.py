@@ -134,7 +134,7 @@ class Terms:
         """Return a group for each term."""
         return np.broadcast_to(np.arange(np.shape(tree)[1]), np.shape(tree))
 
-    def layers(self, tree: Tree) -> list[tuple[Any, Any, str]]:
+    def layers(self, tree: Tree) -> list[tuple[object, object, str]]:
         """Return one layer without bias."""
         return [(tree, None, "identity")]
 

@@ -368,7 +368,7 @@ def _unify(terms: Sequence[Term]) -> list[Term]:
 
     An attribute that one term gives to a parameter holds in all of its terms.
     """
-    said: dict[tuple[str, str], Any] = {}
+    said: dict[tuple[str, str], object] = {}
     for term in terms:
         check_parameter_name(term.parameter)
         check_label("" if term.unit is None else term.unit, f"the unit of '{term.parameter}'")

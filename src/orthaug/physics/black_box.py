@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.host_calls import call_on_host
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import Array, jax, jnp
 
 Groups = tuple[bool, bool, bool]
 """True if x, u and p are each among the variables of slopes."""
@@ -117,7 +117,7 @@ class _Slopes:
         """The variables of the slopes, as entries of z."""
         return np.flatnonzero(np.repeat(self.groups, self.box.widths))
 
-    def __call__(self, rows: Matrix) -> tuple[Any, ...]:
+    def __call__(self, rows: Matrix) -> tuple[Matrix, np.ndarray]:
         return self.box.values(rows), self.box.slopes(rows, self.groups)
 
     def write_one(self, row: int, results: Sequence[int]) -> bool:
@@ -135,7 +135,7 @@ class _Curvature:
         nz = sum(self.box.widths)
         return ((self.box.size, nz, nz),)
 
-    def __call__(self, rows: Matrix) -> tuple[Any, ...]:
+    def __call__(self, rows: Matrix) -> tuple[np.ndarray]:
         return (self.box.curvature(rows),)
 
     def write_one(self, row: int, results: Sequence[int]) -> bool:
@@ -151,10 +151,12 @@ def _point() -> Any:
         return call_on_host(_Values(box), jnp.concatenate([x, u, p]))[0]
 
     @partial(jax.custom_jvp, nondiff_argnums=(0,))
-    def slopes(asked: _Slopes, z: Any) -> Any:
+    def slopes(asked: _Slopes, z: Array) -> Any:
         return call_on_host(asked, z)
 
-    def along(box: BlackBox, primals: Any, tangents: Any) -> Any:
+    def along(
+        box: BlackBox, primals: tuple[Array, Array, Array], tangents: Any
+    ) -> tuple[Array, Array]:
         still = [isinstance(t, jax.custom_derivatives.SymbolicZero) for t in tangents]
         asked = _Slopes(box, (not still[0], not still[1], not still[2]))
         found, to_z = slopes(asked, jnp.concatenate(primals))
@@ -164,14 +166,16 @@ def _point() -> Any:
     value.defjvp(along, symbolic_zeros=True)
 
     @slopes.defjvp
-    def slopes_along(asked: _Slopes, primals: Any, tangents: Any) -> Any:
+    def slopes_along(
+        asked: _Slopes, primals: tuple[Array], tangents: tuple[Array]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         found, to_z = slopes(asked, *primals)
         (moved,) = tangents
         bend = call_on_host(_Curvature(asked.box), *primals)[0]
         along_values = bend_free_slopes(asked, *primals) @ moved
         return (found, to_z), (along_values, bend[:, asked.columns] @ moved)
 
-    def bend_free_slopes(asked: _Slopes, z: Any) -> Any:
+    def bend_free_slopes(asked: _Slopes, z: Array) -> Array:
         return slopes(_Slopes(asked.box, (True, True, True)), z)[1]
 
     return value

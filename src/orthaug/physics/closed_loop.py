@@ -17,8 +17,9 @@ from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, TypeVar
 
-from orthaug._base.checks import check_type, nearest
+from orthaug._base.checks import Matrix, Vector, check_type, nearest
 from orthaug._base.errors import InputError
+from orthaug._base.jax import ArrayModule
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse_named
 from orthaug.physics.controller import Controller
 from orthaug.physics.motion import Motion, Output
@@ -106,9 +107,9 @@ class ClosedLoop(Motion):
         )
         return tuple((name, parsed[name]) for name in order), following
 
-    def _signals(self, y: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+    def _signals(self, y: Matrix, x: Matrix, u: Matrix, p: Vector) -> dict[str, Any]:
         """Return the values that the controller's expressions read, and those it computes."""
-        values: dict[str, Any] = dict(self.constants)
+        values: dict[str, object] = dict(self.constants)
         values |= dict(zip(self.names, p, strict=True))
         sampled = set(self.discrete_states)
         states = zip(self.names_of_states, x, strict=True)
@@ -117,7 +118,7 @@ class ClosedLoop(Motion):
         values |= dict(zip((o.name for o in self.outputs), y, strict=True))
         return values
 
-    def control(self, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def control(self, y: Matrix, x: Matrix, u: Matrix, p: Vector, xp: ArrayModule) -> Matrix:
         values = self._signals(y, x, u, p)
         for name, expression in self._law[0]:
             values[name] = expression.value(values, xp)
@@ -125,7 +126,7 @@ class ClosedLoop(Motion):
             [xp.broadcast_to(xp.asarray(values[n], dtype=float), x.shape[1:]) for n in self.held]
         )
 
-    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         if not self.discrete_states:
             return following
         values = self._signals(y, x, u[len(self.held) :], p)

@@ -236,7 +236,7 @@ class Controller:
         return tuple(name for name, _ in self.outputs)
 
 
-def _coefficients(given: Any, what: str) -> list[str]:
+def _coefficients(given: object, what: str) -> list[str]:
     """Return coefficients as text, without zeros in front.
 
     Raises:

@@ -36,7 +36,7 @@ class Instance(ABC):
     """The function that returns ẋ."""
 
     def __init__(self, description: Any, folder: str) -> None:
-        self._native: dict[str, Any] = {}
+        self._native: dict[str, object] = {}
         self._used = self._running = False
         self._events = description.numberOfEventIndicators > 0
         self.fmu: Any = self._instantiate(
@@ -71,7 +71,7 @@ class Instance(ABC):
         """Write the values of variables to an address; return a status."""
 
     @abstractmethod
-    def slopes(self, unknown: Any, count: int, known: int, seed: int, place: int) -> int:
+    def slopes(self, unknown: object, count: int, known: int, seed: int, place: int) -> int:
         """Write the derivatives by one variable to an address; return a status.
 
         Args:
@@ -97,7 +97,7 @@ class Instance(ABC):
         stride: int,
         count: int,
         nx: int,
-        inputs: Any,
+        inputs: object,
         nu: int,
         read: Callable[[int], int],
     ) -> list[int]:
@@ -162,7 +162,7 @@ class Instance2(Instance):
     version = "fmi2"
     rates_name = "GetDerivatives"
 
-    def __init__(self, description: Any, folder: str) -> None:
+    def __init__(self, description: object, folder: str) -> None:
         super().__init__(description, folder)
         three = c_void_p, c_size_t, c_void_p
         self._enter = self._bound("SetReal", *three)
@@ -195,13 +195,13 @@ class Instance2(Instance):
             raise ArithmeticError("an event has no end")
         return bool(event.needed), bool(event.ends or (event.jumps and self._running))
 
-    def enter(self, references: Any, count: int, place: int) -> int:
+    def enter(self, references: object, count: int, place: int) -> int:
         return self._enter(references, count, place)
 
     def read(self, references: Any, count: int, place: int) -> int:
         return self._read(references, count, place)
 
-    def slopes(self, unknown: Any, count: int, known: int, seed: int, place: int) -> int:
+    def slopes(self, unknown: object, count: int, known: int, seed: int, place: int) -> int:
         if self._along is None:  # not every FMU has it
             kinds = c_void_p, c_size_t, c_void_p, c_size_t, c_void_p, c_void_p
             self._along = self._bound("GetDirectionalDerivative", *kinds)
@@ -214,7 +214,7 @@ class Instance3(Instance):
     version = "fmi3"
     rates_name = "GetContinuousStateDerivatives"
 
-    def __init__(self, description: Any, folder: str) -> None:
+    def __init__(self, description: object, folder: str) -> None:
         super().__init__(description, folder)
         four = c_void_p, c_size_t, c_void_p, c_size_t
         self._enter = self._bound("SetFloat64", *four)
@@ -242,13 +242,13 @@ class Instance3(Instance):
         again, ends, _, jumps, _ = (flag.value for flag in self._flags)
         return again, ends or (jumps and self._running)
 
-    def enter(self, references: Any, count: int, place: int) -> int:
+    def enter(self, references: object, count: int, place: int) -> int:
         return self._enter(references, count, place, count)
 
     def read(self, references: Any, count: int, place: int) -> int:
         return self._read(references, count, place, count)
 
-    def slopes(self, unknown: Any, count: int, known: int, seed: int, place: int) -> int:
+    def slopes(self, unknown: object, count: int, known: int, seed: int, place: int) -> int:
         if self._along is None:
             kinds = *(c_void_p, c_size_t) * 2, c_void_p, c_size_t, c_void_p, c_size_t
             self._along = self._bound("GetDirectionalDerivative", *kinds)

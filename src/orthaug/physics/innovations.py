@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.jax import ArrayModule
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
@@ -56,10 +57,10 @@ class InnovationsForm(Motion):
     def around(self, plant: Motion) -> Motion:
         return innovations_form(plant)
 
-    def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def rates(self, x: Matrix, u: Matrix, p: Vector, xp: ArrayModule) -> Matrix:
         return self._plant.rates(x, u, p[: self.own], xp)
 
-    def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def observed(self, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         return self._plant.observed(x, u, p[: self.own], xp)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from orthaug._base import plugins
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import AnyArray, Array, jax, jnp
 from orthaug._base.registry import Registry
 
 UNROLLED = 4  # substeps; more run as a loop, which compiles faster
@@ -74,7 +74,7 @@ def _uneven_points(inputs: Matrix, hold: str, substeps: int, pace: Vector) -> Ma
     return _interleave(*(spline(np.minimum(t, instants[-1])) for t in ahead))
 
 
-def split_pace(row: Any, hold: str, substeps: int, nu: int) -> tuple[Any, Any]:
+def split_pace(row: AnyArray, hold: str, substeps: int, nu: int) -> tuple[Any, Any]:
     """Return the inputs (…, points nu) that a step reads, and its length over that of an even one.
 
     A row of even samples has no pace; the length is then 1.
@@ -89,7 +89,7 @@ def _interleave(*points: Matrix) -> Matrix:
     return np.stack(points, axis=1).reshape(len(points[0]), -1)
 
 
-def input_at(row: Any, nu: int) -> Callable[[Any, int], Any]:
+def input_at(row: Array, nu: int) -> Callable[[Any, int], Any]:
     """Return u (nu,) as a function of the half substep i of a sample and of their number."""
     points = row.reshape(-1, nu) if nu else row.reshape(1, 0)
     if len(points) == 1:
@@ -114,7 +114,7 @@ class Exponentials(NamedTuple):
     half1: Any
 
     @classmethod
-    def of(cls, linear: Any, h: float) -> Exponentials:
+    def of(cls, linear: Array, h: float) -> Exponentials:
         """Return the exponentials of A (nx, nx) over a step h."""
         # At once: less to compile
         both = jax.vmap(lambda a: _phi(a, 3))(jnp.stack([linear * h, linear * h / 2]))
@@ -197,7 +197,9 @@ INTEGRATORS = Registry(
 )
 
 
-def advance(step: Step, x: Any, row: Any, nu: int, substeps: int, *, looped: bool = False) -> Any:
+def advance(
+    step: Step, x: Array, row: Array, nu: int, substeps: int, *, looped: bool = False
+) -> Array:
     """Return x one sample later.
 
     Args:
@@ -224,7 +226,7 @@ def runge_kutta(field: Field, h: float) -> Step:
     The arrays may be JAX's or NumPy's.
     """
 
-    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+    def one(x: Array, first: Array, middle: Array, last: Array) -> Any:
         k1 = field(x, first)
         k2 = field(x + h / 2 * k1, middle)
         k3 = field(x + h / 2 * k2, middle)
@@ -256,10 +258,10 @@ def _stages_in_a_loop(field: Field, h: float) -> Step:
 def _exponential(field: Field, scheme: Exponentials, h: float) -> Step:
     linear, whole, phi1, phi2, phi3, half, half1 = scheme
 
-    def rest(x: Any, u: Any) -> Any:
+    def rest(x: AnyArray, u: AnyArray) -> Any:
         return field(x, u) - linear @ x
 
-    def one(x: Any, first: Any, middle: Any, last: Any) -> Any:
+    def one(x: Array, first: Array, middle: Array, last: AnyArray) -> Any:
         begin = rest(x, first)
         a = half @ x + half1 @ begin
         at_a = rest(a, middle)
@@ -272,7 +274,7 @@ def _exponential(field: Field, scheme: Exponentials, h: float) -> Step:
     return one
 
 
-def _phi(a: Any, order: int) -> list[Any]:
+def _phi(a: Array, order: int) -> list[Array]:
     """Return e^A, φ₁(A) … φ_order(A), from one exponential of a block matrix (Sidje 1998)."""
     n = len(a)
     size = (order + 1) * n
@@ -282,7 +284,7 @@ def _phi(a: Any, order: int) -> list[Any]:
     return [top[:, i * n : (i + 1) * n] for i in range(order + 1)]
 
 
-def _exponential_less_one(a: Any) -> Any:
+def _exponential_less_one(a: Array) -> Array:
     """Return e^A − I by scaling and squaring.
 
     `E ← 2E + E²` keeps the digits that squaring e^A would lose.
@@ -292,7 +294,7 @@ def _exponential_less_one(a: Any) -> Any:
     """
     a = a / 2**_SQUARINGS
 
-    def further(i: Any, sums: tuple[Any, Any]) -> tuple[Any, Any]:
+    def further(i: Array, sums: tuple[Array, Array]) -> tuple[Array, Array]:
         term = sums[0] @ a / i
         return term, sums[1] + term
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.jax import AnyArray
 from orthaug.physics.black_box import Groups
 from orthaug.physics.fmu_instances import VERSIONS, Instance
 
@@ -144,7 +145,7 @@ class Evaluation:
                 found[rows] = self._slopes(own, p, groups)
         return found
 
-    def curvature(self, z: Matrix) -> Any:
+    def curvature(self, z: Matrix) -> np.ndarray:
         """Return central differences (m, size, n, n) of the slopes, n = nx + nu + np."""
         nx, nu, _ = self.widths
         columns = []
@@ -198,7 +199,7 @@ class Evaluation:
         self._visit(z, p, found, self._reader)
         return found
 
-    def _visit(self, z: Matrix, p: Vector, found: Any, reader: Any) -> None:
+    def _visit(self, z: Matrix, p: Vector, found: AnyArray, reader: Any) -> None:
         """Fill `found` at points by the reader of an instance; NaN where the FMU refuses them."""
         points = _address(z), z.strides[0], len(z)
         failed = self._read_at(points, p.tobytes(), lambda own: reader(own, _address(found)))
@@ -239,7 +240,7 @@ class Evaluation:
             columns.append((self._at(z, up) - self._at(z, down)) / (up[j] - down[j]))
         return np.stack(columns, axis=-1)
 
-    def _differences(self, z: Matrix, p: Vector, asked: Any) -> Any:
+    def _differences(self, z: Matrix, p: Vector, asked: np.ndarray) -> np.ndarray:
         """Return central differences (m, k, size) by k of the states and inputs."""
         m, every = len(z), np.arange(len(asked))
         moved = np.repeat(z[None, None], 2, axis=0).repeat(len(asked), axis=1)  # (2, k, m, nz)
@@ -250,7 +251,7 @@ class Evaluation:
         wide = moved[0, every, :, asked] - moved[1, every, :, asked]
         return np.moveaxis((found[0] - found[1]) / wide[..., None], 0, 1)
 
-    def _own_slopes(self, z: Matrix, p: Vector, asked: Any) -> Any:
+    def _own_slopes(self, z: Matrix, p: Vector, asked: np.ndarray) -> np.ndarray:
         """Return the slopes (m, k, size) by k of the states and inputs that the FMU gives."""
         known = (*(state.valueReference for state in self.unit.states), *self.inputs)
         entries, one = (c_uint * len(asked))(*(known[j] for j in asked)), c_double(1.0)

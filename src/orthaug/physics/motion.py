@@ -17,6 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from orthaug._base.checks import (
+    Matrix,
     Vector,
     check_all,
     check_choice,
@@ -26,6 +27,7 @@ from orthaug._base.checks import (
     nearest,
 )
 from orthaug._base.errors import InputError, show
+from orthaug._base.jax import ArrayModule
 from orthaug._base.views import NotebookView
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.data.record import Record
@@ -242,8 +244,8 @@ class Motion(NotebookView):
     @classmethod
     def from_functions(
         cls,
-        f: Callable[..., Any],
-        h: Callable[..., Any],
+        f: Callable[..., object],
+        h: Callable[..., object],
         states: Sequence[State | str],
         outputs: Sequence[Output | str],
         parameters: Sequence[PhysicalParameter],
@@ -495,21 +497,21 @@ class Motion(NotebookView):
         """The motion without a controller around it."""
         return self
 
-    def control(self, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def control(self, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         """Return the inputs (held, …) that a controller sets at a sample.
 
         From outputs y (ny, …), states x (nx, …), and inputs u (external, …) of the record.
         """
         return u[:0]
 
-    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         """Return the next states (nx, …), with those that change at samples.
 
         `following` are the integrated ones, `u` (nu, …) all inputs at the sample before.
         """
         return following
 
-    def inputs_at(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def inputs_at(self, x: Matrix, u: Matrix, p: Vector, xp: ArrayModule) -> Matrix:
         """Return all inputs (nu, …) at samples with states x (nx, …), from the record's."""
         if not self.held:
             return u

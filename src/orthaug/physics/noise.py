@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug._base.jax import jax, jnp
+from orthaug._base.jax import ArrayModule, jax, jnp
 
 _BLOCK = 64  # rows that one matrix filters; 32 to 128 take as long
 _SHARED = 4  # orders are filled up to a multiple of it, so that they share compiled programs
@@ -195,7 +195,7 @@ class FilterRows(NamedTuple):
             return (self.matrix[0, 0] * total).reshape(shape)
         return xp.einsum("oi,nim->nom", self.matrix, total).reshape(shape)
 
-    def _recurse(self, x: Any, xp: Any) -> Any:
+    def _recurse(self, x: Any, xp: ArrayModule) -> Any:
         """Return `x / C(q)`, a block at a time."""
         (n, ny, m), size, q = x.shape, self.response.shape[-1], self.memory.shape[-1]
         blocks = len(self.follows)

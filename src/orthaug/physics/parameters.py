@@ -225,7 +225,7 @@ class PhysicsMap:
             )
         step = _STEP * np.where(p != 0, np.abs(p), 1.0)
         reals = {**dict(self.constants), **dict(zip(self.names, p, strict=True))}
-        lifted: dict[str, Any] = reals | dict(
+        lifted: dict[str, object] = reals | dict(
             zip(self.names, p[:, None] + 1j * np.diag(step), strict=True)
         )
         theta, jacobian = np.empty(len(self.expressions)), np.empty((len(self.expressions), len(p)))

@@ -72,5 +72,5 @@ def rebuild(declared: Mapping[str, Any], folder: Path) -> PhysicsSource:
     return source
 
 
-def _as_tuples(keys: Mapping[str, Any]) -> dict[str, Any]:
+def _as_tuples(keys: Mapping[str, object]) -> dict[str, object]:
     return {name: tuple(v) if isinstance(v, list) else v for name, v in keys.items()}

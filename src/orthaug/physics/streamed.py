@@ -337,7 +337,12 @@ def _survey(form: Form, source: Source, passes: Passes) -> Survey:
 
 
 def pose_streamed(
-    source: Source, record: Record, passes: Passes, baseline: Baseline, *args: Any, **options: Any
+    source: Source,
+    record: Record,
+    passes: Passes,
+    baseline: Baseline,
+    *args: Any,
+    **options: object,
 ) -> Problem:
     """Return the problem of a source, with a subsample `record` of it in memory.
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.jax import ArrayModule
 from orthaug.data.expressions import Expression
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
@@ -85,11 +86,11 @@ class SuspectedMotion(Motion):
     ) -> dict[str, Any]:
         return self._known.values(x, u[: self._own], p[: self._count], xp, needed)
 
-    def rates(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def rates(self, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         rates = self._known.rates(x, u[: self._own], p[: self._count], xp)
         return self._with_terms(rates, 0, (x, u, p), xp)
 
-    def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def observed(self, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         outputs = self._known.observed(x, u[: self._own], p[: self._count], xp)
         return self._with_terms(outputs, len(self.states), (x, u, p), xp)
 
@@ -101,10 +102,10 @@ class SuspectedMotion(Motion):
     def discrete_states(self) -> tuple[str, ...]:
         return self._known.discrete_states
 
-    def control(self, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def control(self, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         return self._known.control(y, x, u[: len(self._known.external)], p[: self._count], xp)
 
-    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: Any) -> Any:
+    def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         return self._known.after_sample(following, y, x, u[: self._own], p[: self._count], xp)
 
     @property
@@ -121,7 +122,7 @@ class SuspectedMotion(Motion):
         """Number of inputs of the physics."""
         return len(self._known.inputs)
 
-    def _with_terms(self, rows: Any, first: int, at: tuple[Any, Any, Any], xp: Any) -> Any:
+    def _with_terms(self, rows: Any, first: int, at: tuple[Any, Any, Any], xp: ArrayModule) -> Any:
         """Return the rows with their terms added; the first row is that of the place `first`."""
         x, u, p = at
         found = list(rows)

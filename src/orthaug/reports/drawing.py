@@ -190,7 +190,7 @@ def window(response: Response) -> tuple[np.ndarray, slice]:
     return trajectory.time(response.sampling_time)[rows], rows
 
 
-def legend(axis: Axes, *shown: Any) -> None:
+def legend(axis: Axes, *shown: object) -> None:
     """Draw the legend above the panel: of its own lines, or of those in `shown`."""
     axis.legend(
         *shown,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -134,7 +133,7 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     return figure
 
 
-def _floats(values: Sequence[Any]) -> np.ndarray:
+def _floats(values: Sequence[object]) -> np.ndarray:
     """Return the numbers of a result, NaN for None."""
     return np.array(values, dtype=float)
 

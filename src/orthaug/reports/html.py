@@ -62,7 +62,7 @@ class Card:
     notes: Sequence[str] = ()
 
 
-def html_of(shown: Any) -> str:
+def html_of(shown: object) -> str:
     """Return the object, or a card, as HTML, escaped."""
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
@@ -82,7 +82,7 @@ def _shorten_table(table: Table) -> Sequence[Sequence[str]]:
 
 
 @singledispatch
-def card_of(shown: Any) -> Card:
+def card_of(shown: object) -> Card:
     """Return the card of an object."""
     return Card(repr(shown))
 

@@ -177,7 +177,7 @@ def gain_unit(view: LinearView, i: int, j: int) -> str:
     return "/".join(wrapped)
 
 
-def _point(view: LinearView, found: Linearization) -> dict[str, Any]:
+def _point(view: LinearView, found: Linearization) -> dict[str, object]:
     agreement = found.agreement(view)
     return {
         "at": view.point.values,
@@ -200,7 +200,7 @@ def _point(view: LinearView, found: Linearization) -> dict[str, Any]:
     }
 
 
-def _matrices(view: LinearView) -> dict[str, Any]:
+def _matrices(view: LinearView) -> dict[str, object]:
     n, found = view.system.states, {}
     parts = {"a": np.s_[:n, :n], "b": np.s_[:n, n:], "c": np.s_[n:, :n], "d": np.s_[n:, n:]}
     for name, part in parts.items():
@@ -211,11 +211,11 @@ def _matrices(view: LinearView) -> dict[str, Any]:
     return found
 
 
-def _pair(view: LinearView, i: int, j: int) -> dict[str, Any]:
+def _pair(view: LinearView, i: int, j: int) -> dict[str, object]:
     return {"output": view.outputs[i], "input": view.inputs[j], "unit": gain_unit(view, i, j)}
 
 
-def _gain(view: LinearView, i: int, j: int) -> dict[str, Any]:
+def _gain(view: LinearView, i: int, j: int) -> dict[str, object]:
     return _pair(view, i, j) | {
         "value": None if view.gain is None else view.gain[i, j],
         "ci95": None if view.gain_ci95 is None else view.gain_ci95[i, j],
@@ -235,7 +235,7 @@ def _continuous(view: LinearView) -> dict[str, Any]:
     }
 
 
-def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
+def _response(view: LinearView, i: int, j: int) -> dict[str, object]:
     bode = view.bode
     assert bode is not None
     fields = _pair(view, i, j)
@@ -246,7 +246,7 @@ def _response(view: LinearView, i: int, j: int) -> dict[str, Any]:
     return fields
 
 
-def _measured_entry(measured: MeasuredResponse, view: LinearView) -> dict[str, Any]:
+def _measured_entry(measured: MeasuredResponse, view: LinearView) -> dict[str, object]:
     phases = phase_of(measured.value)
     pairs = [
         {

@@ -312,7 +312,7 @@ def selection_figure(result: SelectResult, unit: str) -> Figure:
 @plain
 def tracking_figure(
     history: pd.DataFrame,
-    parameters: Sequence[Any],
+    parameters: Sequence[object],
     alarms: Sequence[float],
     title: str | None = None,
     physical: pd.DataFrame | None = None,

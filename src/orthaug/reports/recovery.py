@@ -172,8 +172,8 @@ class RecoverResult(ResultHeader):
         facts: Mapping[str, Any],
         true: Mapping[str, float],
         units: Mapping[str, str],
-        planted: Sequence[Mapping[str, Any]],
-        outcomes: Sequence[Mapping[str, Any]],
+        planted: Sequence[Mapping[str, object]],
+        outcomes: Sequence[Mapping[str, object]],
     ) -> RecoverResult:
         """Return the content from what every draw gave.
 
@@ -213,7 +213,7 @@ def _draw(
     outcome: Mapping[str, Any],
     planted: Sequence[Mapping[str, Any]],
     true: Mapping[str, float],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return what a draw shows of each parameter, and whether that holds the truth."""
     first, found = outcome["rows"][0], {}
     for name, row in first["parameters"].items():
@@ -229,7 +229,7 @@ def _draw(
     return {"draw": number, "term": name} | own
 
 
-def _is_silent(row: Mapping[str, Any]) -> bool:
+def _is_silent(row: Mapping[str, object]) -> bool:
     return row["held_with_bias"] is False and not row["warned"]
 
 
@@ -241,7 +241,7 @@ def _recovered(
     outcomes: Sequence[Mapping[str, Any]],
     rows: int,
     twice: Mapping[str, Mapping[str, Any] | None],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the row of a parameter.
 
     Args:
@@ -295,11 +295,11 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 def _term(
     number: int,
-    planted: Mapping[str, Any],
+    planted: Mapping[str, object],
     drawn: Sequence[Mapping[str, Any]],
     outcomes: Sequence[Mapping[str, Any]],
     true: Mapping[str, float],
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the row of a planted term."""
     pairs = [pair for pair in zip(drawn, outcomes, strict=True) if pair[1]["term"] == number]
     rows = [row for one, _ in pairs for row in one["parameters"].values()]
@@ -334,8 +334,8 @@ def _relative_error(parameters: Mapping[str, Any], true: Mapping[str, float]) ->
 def _choices(
     outcomes: Sequence[Mapping[str, Any]],
     true: Mapping[str, float],
-    drawn: Sequence[Mapping[str, Any]],
-) -> list[dict[str, Any]]:
+    drawn: Sequence[Mapping[str, object]],
+) -> list[dict[str, object]]:
     """Return the row of every choice, the declared one first, the others by their error."""
     compared = [one for one in outcomes if len(one["rows"]) > 1]
     names = dict.fromkeys((row["kind"], row["name"]) for one in compared for row in one["rows"])
@@ -358,7 +358,7 @@ def _choices(
     )
 
 
-def _chosen(name: str, true: float, fits: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _chosen(name: str, true: float, fits: Sequence[Mapping[str, Any]]) -> dict[str, object]:
     own = [fit[name] for fit in fits if name in fit]
     shifts = [row["value"] - true for row in own if row["value"] is not None]
     return {

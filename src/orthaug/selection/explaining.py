@@ -391,7 +391,7 @@ def _grow(space: Space, chosen: list[Candidate]) -> list[Candidate]:
 
 def _best_single(space: Space, chosen: Sequence[Candidate]) -> list[Candidate]:
     gains = space.gains([space.column(one) for one in chosen])
-    found: dict[Any, Candidate] = {}
+    found: dict[object, Candidate] = {}
     for i in np.argsort(-np.round(gains, _DIGITS), kind="stable"):
         if len(found) == _TRIED or gains[i] <= 0:
             break
@@ -408,7 +408,7 @@ def _best_pairs(space: Space, others: Sequence[Candidate]) -> list[tuple[Candida
     size, along = np.einsum("kr,kr->k", x, x), x @ y
     able = np.flatnonzero(size > _OWN)
     x, size, along = x[able], size[able], along[able]
-    found: dict[Any, tuple[float, Candidate, Candidate]] = {}
+    found: dict[object, tuple[float, Candidate, Candidate]] = {}
     for begin in range(0, len(able), _BLOCK):
         rows = slice(begin, begin + _BLOCK)
         across = x[rows] @ x.T

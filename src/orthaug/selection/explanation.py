@@ -242,7 +242,7 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def _toml(value: Any) -> str:
+def _toml(value: object) -> str:
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)
 
 

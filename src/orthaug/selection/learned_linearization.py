@@ -286,7 +286,7 @@ class MotionResponse:
 @partial(jax.jit, static_argnames="form")
 def _derivatives(
     form: MotionDynamics, numbers: Numbers, x: Array, u: Array, rows: Array
-) -> tuple[Any, Any]:
+) -> tuple[Array, Array]:
     """Return ∂(next state)/∂x and ∂y/∂x at points."""
     numbers = form.prepare(numbers)
     steps = jax.vmap(lambda x, row: jax.jacfwd(lambda s: form.step(numbers, s, row)[0])(x))(x, rows)
@@ -330,7 +330,7 @@ class _Run(NamedTuple):
     x: Matrix
     u: Matrix
     rows: Matrix
-    begins: Any
+    begins: np.ndarray
 
     @classmethod
     def of(cls, model: Model[MotionDynamics], record: Record) -> _Run:

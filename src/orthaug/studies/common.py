@@ -200,7 +200,7 @@ def draw_record(
     return Example(Record.from_arrays(u, y), example.test, example.baseline, example.theta)
 
 
-def rows_of(table: pd.DataFrame, **values: Any) -> pd.DataFrame:
+def rows_of(table: pd.DataFrame, **values: object) -> pd.DataFrame:
     """Return the rows of a table with these values in these columns, in the table's order."""
     for column, value in values.items():
         table = table.loc[table[column] == value]
@@ -315,13 +315,13 @@ def signed_text(exponent: float) -> str:
     return f"{exponent:.2f}".replace("-", "−")
 
 
-def agreement(values: Any) -> str:
+def agreement(values: object) -> str:
     """Return a text on the largest difference between starts, one row of values each."""
     apart = float(np.ptp(np.asarray(values, dtype=float), axis=0).max())
     return f"starts agree within {apart:.1g}" if apart else "the same number for every start"
 
 
-def span(values: Any) -> str:
+def span(values: object) -> str:
     """Return `mean (smallest … largest)` in three digits.
 
     It is one number where they agree in all of them.

@@ -73,7 +73,7 @@ def one(data_set: int, draw: int) -> dict[str, Any]:
     fit = estimate(record, example.baseline, **options)
     uniform = fit.split(UNIFORM)
     deviation = np.sqrt(np.diag(fit.joint_covariance("paper"))[: len(fit.theta)])
-    result: dict[str, Any] = {"theta": fit.theta, "theta_uniform": uniform.theta}
+    result: dict[str, object] = {"theta": fit.theta, "theta_uniform": uniform.theta}
     intervals = {
         "training": fit.interval,
         "paper": interval(fit.theta, deviation, fit.freedom),

@@ -64,7 +64,7 @@ def _ratio(ours: float, end: float) -> str:
 
 
 @cache
-def _tables() -> dict[str, dict[tuple[Any, ...], Mapping[str, Any]]]:
+def _tables() -> dict[str, dict[tuple[object, ...], Mapping[str, object]]]:
     content = json.loads(
         files("orthaug.studies").joinpath("references.json").read_text(encoding="utf-8")
     )

@@ -166,7 +166,7 @@ def write(
         (partial / "index.html").write_text(_page(reproduced, pipeline), encoding="utf-8")
 
 
-def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, Any]]:
+def as_rows(reproduced: Sequence[StudyOutcome]) -> list[dict[str, object]]:
     """Return the findings as plain rows, each with its study."""
     return [
         {"study": study.entry.name, **finding._asdict()}
@@ -191,7 +191,7 @@ def reduced_text(reproduced: Sequence[StudyOutcome]) -> str:
     )
 
 
-def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, Any]:
+def _size(reproduced: Sequence[StudyOutcome]) -> dict[str, object]:
     """Return the reduced size in words, null at full size, and each study's runs of all."""
     studies = {
         study.entry.name: {"runs": len(study.runs), "of": study.whole} for study in reproduced

@@ -108,7 +108,7 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-def _text(function: Callable[..., Any]) -> str:
+def _text(function: Callable[..., object]) -> str:
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
@@ -212,7 +212,7 @@ def _read(store: Path | None, study: Study, case: Case) -> Run | None:
         return None
 
 
-def _checksum(study: Study, case: Case, content: dict[str, Any]) -> str:
+def _checksum(study: Study, case: Case, content: Mapping[str, object]) -> str:
     """Return a digest of a record and the case it belongs to."""
     written = json.dumps([study.key(case), content], sort_keys=True, allow_nan=False)
     return hashlib.sha256(written.encode()).hexdigest()
@@ -221,7 +221,7 @@ def _checksum(study: Study, case: Case, content: dict[str, Any]) -> str:
 def _write(store: Path | None, study: Study, run: Run) -> None:
     if store is None:
         return
-    content: dict[str, Any] = {"made": run.made, "seconds": run.seconds, "result": run.result}
+    content: dict[str, object] = {"made": run.made, "seconds": run.seconds, "result": run.result}
     content["sha256"] = _checksum(study, run.case, content)
     path = _path(store, study, run.case)
     try:
@@ -232,7 +232,7 @@ def _write(store: Path | None, study: Study, run: Run) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror}).") from None
 
 
-def _plain(study: Study, result: Mapping[str, Any]) -> dict[str, Any]:
+def _plain(study: Study, result: Mapping[str, object]) -> dict[str, object]:
     return {key: _value(study, key, value) for key, value in result.items()}
 
 

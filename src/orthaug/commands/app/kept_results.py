@@ -103,5 +103,5 @@ def _change(before: str, after: str) -> str:
     return ", ".join(listed) or "the same spec again"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return "none" if value is None else str(value)

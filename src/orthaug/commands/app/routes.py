@@ -103,7 +103,7 @@ class Page:
             if event.args in _PARTS:
                 tabs.set_value(event.args)
 
-        def reopen(event: Any) -> None:
+        def reopen(event: object) -> None:
             if tabs.value == start:  # otherwise another page was faster
                 go(event)
 

@@ -115,7 +115,7 @@ def _absolute_path(folder: Path, file: Any) -> Any:
     return Path(os.path.abspath(folder / file)).as_posix() if isinstance(file, str) else file
 
 
-def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
+def _with_files(document: Mapping[str, object]) -> Iterator[Any]:
     data = section(document, "data")
     parts = [data.get("train"), data.get("validation"), *section(data, "tests").values()]
     for entry in (*parts, section(document, "structure").get("measure")):
@@ -123,7 +123,7 @@ def _with_files(document: Mapping[str, Any]) -> Iterator[Any]:
             yield entry
 
 
-def files(content: Mapping[str, Any]) -> list[str]:
+def files(content: Mapping[str, object]) -> list[str]:
     """Return every data file that a spec names, the training data first, each once."""
     return list(
         dict.fromkeys(file for entry in _with_files(content) for file in names(entry, "files"))
@@ -157,7 +157,7 @@ def names(table: Mapping[str, Any], key: str) -> list[str]:
     return [name for name in found if isinstance(name, str)] if isinstance(found, list) else []
 
 
-def field_text(value: Any) -> str:
+def field_text(value: object) -> str:
     """Return a value as a field shows it."""
     return (
         ""
@@ -195,7 +195,7 @@ def _make_table(document: Any, path: Sequence[str]) -> Any:
     return document
 
 
-def plain(text: str) -> dict[str, Any]:
+def plain(text: str) -> dict[str, object]:
     """Return the content in plain dictionaries and lists.
 
     Raises:
@@ -221,13 +221,13 @@ def edit_text(text: str, change: Callable[[Any], None]) -> str:
     return written
 
 
-def with_value(text: str, path: Sequence[str], value: Any) -> str:
+def with_value(text: str, path: Sequence[str], value: object) -> str:
     """Return the text with a key of a table set, or removed where the value is None.
 
     Missing tables on the path are added.
     """
 
-    def change(document: Any) -> None:
+    def change(document: object) -> None:
         table = _make_table(document, path[:-1])
         if value is None:
             table.pop(path[-1], None)
@@ -255,7 +255,7 @@ def with_name(text: str, path: Sequence[str], new: str) -> str:
     if not re.fullmatch(r"[A-Za-z]\w*", new, re.ASCII) or new in known:
         raise InputError(f"'{new}' is taken, or no name: letters, digits and underscores.")
 
-    def renamed(value: Any) -> Any:
+    def renamed(value: object) -> Any:
         own = rf"\b{re.escape(old)}\b"
         return re.sub(own, new, value) if isinstance(value, str) else value
 
@@ -276,7 +276,7 @@ def with_name(text: str, path: Sequence[str], new: str) -> str:
     return edit_text(text, change)
 
 
-def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
+def rows_of(text: str, path: Sequence[str]) -> list[dict[str, object]]:
     """Return the tables of a list of tables, such as `data.prepare`.
 
     Empty where there is no such list.
@@ -287,10 +287,10 @@ def rows_of(text: str, path: Sequence[str]) -> list[dict[str, Any]]:
     )
 
 
-def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
+def with_row(text: str, path: Sequence[str], row: Mapping[str, object]) -> str:
     """Return the text with one more table at the end of a list of tables."""
 
-    def change(document: Any) -> None:
+    def change(document: object) -> None:
         table = _make_table(document, path[:-1])
         rows = table.get(path[-1])
         if not isinstance(rows, list) or (not rows and not isinstance(rows, AoT)):
@@ -308,7 +308,7 @@ def with_row(text: str, path: Sequence[str], row: Mapping[str, Any]) -> str:
 def with_field(text: str, path: Sequence[str], index: int, key: str, entered: str) -> str:
     """Return the text with a key of one table of a list set; an empty field removes it."""
 
-    def change(document: Any) -> None:
+    def change(document: object) -> None:
         row, value = _table_at(document, path)[index], read(key, entered)
         if value is None:
             row.pop(key, None)
@@ -321,7 +321,7 @@ def with_field(text: str, path: Sequence[str], index: int, key: str, entered: st
 def without_row(text: str, path: Sequence[str], index: int) -> str:
     """Return the text without one table of a list."""
 
-    def change(document: Any) -> None:
+    def change(document: object) -> None:
         rows = _table_at(document, path)
         del rows[index]
         if not rows:
@@ -372,7 +372,7 @@ _OF_PHYSICS = (
 """What of a spec belongs to one kind of physics alone."""
 
 
-def kind_of_physics(content: Mapping[str, Any]) -> str:
+def kind_of_physics(content: Mapping[str, object]) -> str:
     """Return the kind of physics of a spec: `terms`, `motion` or `source`."""
     if section(content, "physics", "source"):
         return "source"
@@ -389,7 +389,7 @@ def with_physics(text: str, kind: str, shelf: Shelf) -> str:
     present = kind_of_physics(plain(text))
     if kind == present:
         return text
-    taken: dict[tuple[str, ...], Any] = {}
+    taken: dict[tuple[str, ...], object] = {}
     known = shelf.get(kind) or _first_physics(text, kind)
 
     def change(document: Any) -> None:
@@ -405,7 +405,7 @@ def with_physics(text: str, kind: str, shelf: Shelf) -> str:
     return made
 
 
-def _first_physics(text: str, kind: str) -> dict[tuple[str, ...], Any]:
+def _first_physics(text: str, kind: str) -> dict[tuple[str, ...], object]:
     data = section(plain(text), "data")
     inputs, outputs = names(data, "inputs") or ["0"], names(data, "outputs") or ["y"]
     if kind == "terms":

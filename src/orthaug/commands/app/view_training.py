@@ -162,7 +162,7 @@ class TrainingView:
         if state == self._models:
             return
         self._models = state
-        rows: dict[str, list[dict[str, Any]]] = {}
+        rows: dict[str, list[dict[str, object]]] = {}
         for i, (name, model) in enumerate(models.items(), 1):
             for output, own in model["outputs"].items():
                 label = f"{output} [{own['unit']}]" if own["unit"] else output
@@ -284,7 +284,7 @@ def _runs(found: Mapping[str, Any] | None) -> None:
         )
 
 
-def _less(measured: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
+def _less(measured: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, object]:
     """Return the curve of measured less model."""
     pairs = zip(measured["y"], run["y"], strict=True)
     return {**run, "y": [None if a is None or b is None else a - b for a, b in pairs]}
@@ -294,7 +294,7 @@ def _listed(names: Sequence[str]) -> str:
     return " and ".join(", ".join(names).rsplit(", ", 1))
 
 
-def _draw_pair(pair: Sequence[KeptResult], curves: Mapping[str, Any] | None) -> None:
+def _draw_pair(pair: Sequence[KeptResult], curves: Mapping[str, object] | None) -> None:
     """Draw two results beside each other."""
     read = [json.loads((one.folder / "result.json").read_text(encoding="utf-8")) for one in pair]
     models = [(one.name, result["parameters"]) for one, result in zip(pair, read, strict=True)]

@@ -28,12 +28,12 @@ def label_widget(element: Drawn, label: str) -> Drawn:
     return element
 
 
-def text(what: Any, tag: str = "p", classes: str = "") -> ui.html:
+def text(what: object, tag: str = "p", classes: str = "") -> ui.html:
     """Return an element with text that is never read as HTML."""
     return ui.html(marked(what), sanitize=False, tag=tag).classes(classes)
 
 
-def marked(what: Any) -> str:
+def marked(what: object) -> str:
     """Return escaped text: `names` as code, and no line breaks at the minus of a lag."""
     lines = re.sub(r"`([^`\n]+)`", r"<code>\1</code>", escape(str(what)))
     return re.sub(r"\[k-\d+\]", r"<span class='n'>\g<0></span>", lines)
@@ -63,7 +63,7 @@ def redrawn(place: ui.element) -> Any:
 
 
 def field(
-    label: str, value: Any, changed: Callable[[str], None], *, classes: str = "", hint: str = ""
+    label: str, value: object, changed: Callable[[str], None], *, classes: str = "", hint: str = ""
 ) -> ui.input:
     """Return a line of text; `on_change` is called when it is left, or by Enter."""
     made = (
@@ -133,13 +133,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
         label_widget(made.props("tabindex=0 role=region"), caption or head[0])
 
 
-def number(value: Any, digits: int = 5) -> str:
+def number(value: object, digits: int = 5) -> str:
     """Return a number as text; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}g}"
 
 
 def button(
-    label: str, clicked: Callable[[], Any], *, main: bool = False, classes: str = ""
+    label: str, clicked: Callable[[], object], *, main: bool = False, classes: str = ""
 ) -> ui.button:
     """Return a button; the main one of a card is filled."""
     made = ui.button(label, on_click=clicked, color=None).props(
@@ -168,13 +168,13 @@ _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 def curves_figure(
     rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s"
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return a figure of curves below one another on a common time axis.
 
     Each row has a label, and traces with `x`, `y`, `name` and `raw`; where they have an `entry`,
     each name has one in the legend, and the color of that number.
     """
-    traces: list[dict[str, Any]] = []
+    traces: list[dict[str, object]] = []
     named = set[str]()
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {
@@ -232,7 +232,7 @@ def curves_figure(
 
 def interval_figure(
     models: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], units: Mapping[str, str]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return a figure of each parameter in every model, with its 95 % interval.
 
     A thin bar is the interval with the bias, which need not hold the estimate.
@@ -301,7 +301,7 @@ def of_several(runs: Iterable[Run]) -> bool:
     return len({run.structure for run in runs if run.structure}) > 1
 
 
-def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, Any]:
+def loss_figure(losses: Sequence[tuple[Run, int, float | None]]) -> dict[str, object]:
     """Return a figure of the loss of every run over its iterations.
 
     Each run has a name below the axis; of several structures, each structure has one. A curve is
@@ -368,7 +368,7 @@ def _compact_layout(title: str) -> dict[str, Any]:
 
 
 def _layout(height: int) -> dict[str, Any]:
-    plain: dict[str, Any] = {
+    plain: dict[str, object] = {
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "height": height,
@@ -384,6 +384,6 @@ def _layout(height: int) -> dict[str, Any]:
     }
 
 
-def plot(figure: dict[str, Any], label: str) -> ui.plotly:
+def plot(figure: dict[str, object], label: str) -> ui.plotly:
     """Return a figure with a text for screen readers."""
     return label_widget(ui.plotly(figure).classes("plot").props("role=img"), label)

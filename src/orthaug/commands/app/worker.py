@@ -65,7 +65,7 @@ def _listen(asked: queue.Queue[str]) -> None:
     os._exit(0)
 
 
-def _answer(given: dict[str, Any]) -> dict[str, Any]:
+def _answer(given: dict[str, Any]) -> dict[str, object]:
     try:
         return QUESTIONS[given.pop("question")](**given)
     except InputError as error:
@@ -98,7 +98,7 @@ def peak() -> float:
 
 def look(
     path: str, out: str, inputs: str | None, outputs: str | None, step: float | None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the columns of a file, their curves, and a first spec where its channels are known.
 
     Args:
@@ -108,7 +108,7 @@ def look(
         step: sampling time in s where the user gave it.
     """
     found = starting.look(Path(path))
-    answer: dict[str, Any] = {
+    answer: dict[str, object] = {
         "columns": [_column(found, column) for column in found.columns],
         "rows": max(column.filled for column in found.columns),
         "timed": _time_text(found),
@@ -163,7 +163,7 @@ def _column(found: Survey, column: Column) -> dict[str, Any]:
     return own | {"description": described.removeprefix(f"{head}: ")}
 
 
-def _curves(found: Survey) -> dict[str, Any]:
+def _curves(found: Survey) -> dict[str, object]:
     step = found.clock.step or 1.0
     curves = {}
     for column in found.signals[:_DRAWN]:
@@ -178,7 +178,7 @@ def _curves(found: Survey) -> dict[str, Any]:
     return curves
 
 
-def examine(path: str, whole: bool) -> dict[str, Any]:
+def examine(path: str, whole: bool) -> dict[str, object]:
     """Return the findings of `orthaug check` for a spec, and its prepared training data.
 
     Args:
@@ -187,7 +187,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     """
     job = open_job(Path(path), require_full_rank=False)
     runs = job.physics.runs_in_check
-    answer: dict[str, Any] = {"check": None, "refusal": None, "bias": []}
+    answer: dict[str, object] = {"check": None, "refusal": None, "bias": []}
     if whole or not runs:
         if runs:
             from orthaug._base.jax import use_compilation_cache
@@ -211,7 +211,7 @@ def examine(path: str, whole: bool) -> dict[str, Any]:
     }
 
 
-def example(folder: str) -> dict[str, Any]:
+def example(folder: str) -> dict[str, object]:
     """Write the records of the built-in example into a folder; return its spec."""
     from orthaug.commands import demo
     from orthaug.studies.synthetic import mass_spring_damper
@@ -237,7 +237,7 @@ def verdict(path: str, kind: str) -> dict[str, Any]:
     return {"level": found.level, "sentences": found.sentences}
 
 
-def starts(path: str) -> dict[str, Any]:
+def starts(path: str) -> dict[str, object]:
     """Return initial values for the parameters of a motion, by name.
 
     The physics alone is fitted to the first rows in segments that lengthen: short ones find
@@ -266,7 +266,7 @@ def starts(path: str) -> dict[str, Any]:
     return {"values": values}
 
 
-def free_runs(path: str, models: dict[str, str]) -> dict[str, Any]:
+def free_runs(path: str, models: dict[str, str]) -> dict[str, object]:
     """Return measured outputs and the free runs of saved models, by part and output of a spec.
 
     Of each part it is the stretch on which the first model errs most.
@@ -283,7 +283,7 @@ def free_runs(path: str, models: dict[str, str]) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, Any]]:
+def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, object]]:
     """Return for each output the curves of the worst stretch of one experiment."""
     from orthaug.reports.page_runs import worst_window
 
@@ -319,7 +319,7 @@ def _units(job: Job) -> list[tuple[str, str, str | None]]:
     return [(name, unit, derived.get(name)) for name, unit in job.physics.declared_units.items()]
 
 
-def _prepared_curves(job: Job) -> dict[str, Any]:
+def _prepared_curves(job: Job) -> dict[str, object]:
     """Return the curves by channel of the training data, with gaps between experiments."""
     record = job.train.record
     channels: Sequence[Channel] = (*record.inputs, *record.outputs)
@@ -368,7 +368,7 @@ def _plain(values: Vector) -> list[float | None]:
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-QUESTIONS: dict[str, Callable[..., dict[str, Any]]] = {
+QUESTIONS: dict[str, Callable[..., dict[str, object]]] = {
     "look": look,
     "examine": examine,
     "example": example,

@@ -40,7 +40,7 @@ class _GradientState(NamedTuple):
     unknowns: tuple[Float[Array, "nt"], Float[Array, "nw"]]
     optimizer: Any
     loss: Float[Array, ""]
-    iteration: Any
+    iteration: Array
     small: Any
 
 
@@ -134,7 +134,9 @@ def _goes_on(state: _GradientState) -> Array:
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _value(criterion: PaperCriterion, unknowns: Any, chunks: Chunk, physics: Physics) -> Array:
+def _value(
+    criterion: PaperCriterion, unknowns: tuple[Array, Array], chunks: Chunk, physics: Physics
+) -> Array:
     return criterion(unknowns, chunks, physics)
 
 
@@ -173,7 +175,7 @@ def _lbfgs(
 
     optimizer = optax.lbfgs(memory_size=_MEMORY)
 
-    def value(unknowns: Any) -> Array:
+    def value(unknowns: tuple[Array, Array]) -> Array:
         return criterion(unknowns, chunks, physics)
 
     value_and_grad = optax.value_and_grad_from_state(value)

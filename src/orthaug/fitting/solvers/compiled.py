@@ -126,7 +126,7 @@ class Settings(minimize.Settings):
 def minimize_compiled(
     criterion: Callable[..., Normal],
     w: Float[Array, "nw"],
-    arguments: tuple[Any, ...],
+    arguments: tuple[object, ...],
     overlap: Overlap,
     settings: Settings,
 ) -> TrainingRun:
@@ -203,7 +203,7 @@ def _advance(
     criterion: Any,
     damping: Damping,
     state: State,
-    arguments: tuple[Any, ...],
+    arguments: tuple[object, ...],
     options: Options,
     stop: Array,
 ) -> State:
@@ -266,7 +266,7 @@ def _prior(alpha: Array, w: Array) -> Array:
     return alpha * (w @ w) if alpha.ndim == 0 else w @ (alpha * w)
 
 
-def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
+def _evidence(w: Array, normal: Normal, alpha: Array, options: Options) -> Any:
     """Return the ridge of the evidence, or of each group's; see `damped_step.evidence_ridge`."""
     if options.groups is None:
         effective = effective_weights(normal, alpha)
@@ -282,7 +282,7 @@ def _evidence(w: Any, normal: Normal, alpha: Any, options: Options) -> Any:
 
 
 @jax.jit
-def effective_weights(normal: Normal, alpha: Any) -> Any:
+def effective_weights(normal: Normal, alpha: Array) -> Any:
     """Return tr(H (H + αI)⁻¹).
 
     Directions that are rounding beside the columns of J count as absent.

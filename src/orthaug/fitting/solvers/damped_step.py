@@ -129,7 +129,7 @@ def judge(
     stuck: AnyArray | bool,
     level: AnyArray | bool,
     unit: AnyArray | float,
-    tolerance: Any,
+    tolerance: AnyArray | float,
     xp: ArrayModule,
 ) -> StepControl:
     """Return the control after a tried step.
@@ -191,13 +191,13 @@ def effective_of_each(hessian: Array, ridge: Array, xp: ArrayModule) -> Array:
 
 
 def evidence_ridge(
-    loss: Any,
+    loss: AnyArray | float,
     effective: Any,
     size: AnyArray | float,
-    samples: Any,
+    samples: AnyArray | float,
     xp: Any,
     *,
-    total: Any = None,
+    total: AnyArray | None = None,
     share: Any = 1.0,
 ) -> AnyArray | float:
     """Return MacKay's fixed point `α = γσ²/(κ‖w‖²)` with `σ² = ‖r‖² / (N − γ/κ)`.

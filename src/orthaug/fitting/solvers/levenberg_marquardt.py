@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from annotated_types import Ge
 from jaxtyping import Float
@@ -19,6 +19,10 @@ from orthaug.fitting.solvers.damped_step import IDENTITY
 from orthaug.fitting.solvers.limit import Limit, longest_of
 from orthaug.fitting.solvers.minimize import Descent, SquaredResiduals, minimize
 from orthaug.models.rows import Overlap
+
+if TYPE_CHECKING:
+    from orthaug.fitting.initial_states import Start
+
 
 _ITERATIONS = 300  # the default limit
 
@@ -76,7 +80,7 @@ class LevenbergMarquardt:
         self,
         criterion: Callable[..., Normal],
         w: Float[Array, "nw"],
-        arguments: tuple[Any, ...],
+        arguments: tuple[object, ...],
         overlap: Overlap,
         **options: Any,
     ) -> TrainingRun:
@@ -102,7 +106,7 @@ class LevenbergMarquardt:
         self,
         objective: SquaredResiduals,
         p: Vector,
-        start: Any,
+        start: Start,
         *,
         noticeable: float = 0.0,
         **options: Any,

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool
@@ -25,6 +25,10 @@ from orthaug.fitting.solvers import damped_step
 from orthaug.fitting.solvers.damped_step import MARQUARDT, Damping, StepControl
 from orthaug.fitting.solvers.limit import Limit, Tail
 from orthaug.fitting.status import Ending
+
+if TYPE_CHECKING:
+    from orthaug.fitting.initial_states import Start
+
 
 _SETTLED = 0.1  # of the objective: a step that lowers it by less belongs to the end of a run
 LEARNED = 0.9  # of the first loss: what is lower has learned something
@@ -95,7 +99,7 @@ class Settings:
             return False
         return not self.limit.is_past(int(state.iteration), float(state.mark), float(state.loss))
 
-    def report(self, state: RunState, packed: Any) -> bool:
+    def report(self, state: RunState, packed: object) -> bool:
         """Report the state to a listener and to checkpoints; return whether to end the run."""
         try:
             self.progress(int(state.iteration), float(state.loss))
@@ -109,7 +113,7 @@ class Settings:
         self,
         state: _State,
         advance: Callable[[_State, int], _State],
-        pack: Callable[[_State], Any] | None = None,
+        pack: Callable[[_State], object] | None = None,
     ) -> tuple[_State, Ending]:
         """Take steps to the end of the run: the loop around every step.
 
@@ -268,7 +272,7 @@ class _Rules:
     upper: Vector
     ceiling: float
 
-    def begin(self, p: Vector, start: Any, *, evidence_begun: bool) -> _Iterate | Trial:
+    def begin(self, p: Vector, start: Start, *, evidence_begun: bool) -> _Iterate | Trial:
         """Return the first iterate, or the trial at the start where that is not finite."""
         point = self.objective.evaluate(np.clip(p, self.lower, self.upper), start)
         linear = self.objective.linearise(point) if np.isfinite(point.loss) else None
