@@ -159,7 +159,8 @@ class GuessedMotion:
 
         Modes that samples do not show, or whose exponential has no digits.
         """
-        sampling_time, modes = self.record.sampling_time, self.modes
+        modes: Any = self.modes
+        sampling_time = self.record.sampling_time
         lasting = modes[modes.real * sampling_time > _GONE]
         turned = float(np.abs(lasting.imag).max(initial=0.0)) * sampling_time
         fast = self.fastest * sampling_time / self.substeps
