@@ -6,6 +6,7 @@ import html
 import json
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ from helpers import unfolded
 from test_motion_cli import friction, orthaug
 
 import orthaug as oa
+from orthaug.analysis.findings import LateInputResult
 from orthaug.commands.advice import (
     Proposal,
     ProposalErrors,
     ValidationRows,
     _conclude_trials,
+    _delay,
     _unique_proposals,
     apply_change,
 )
@@ -354,6 +357,34 @@ def test_a_much_lower_error_without_sure_gain_says_why():
     )
     assert not advice, advice
     assert "lower, but not surely on other rows" in trials.text
+
+
+def test_an_input_that_is_logged_late_is_advised_before_a_term_of_the_same_error():
+    """The step adds no parameter; its rows end a sample before those of the present model."""
+    rng = np.random.default_rng(3)
+    base = [1e-3 * rng.normal(size=200) ** 8]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    late = LateInputResult(
+        input="u",
+        delay=-1,
+        delayed=0.02,
+        time_constant=0.0,
+        lagged=0.1,
+        declared=0.1,
+        by_lag=False,
+        alike=False,
+    )
+    job: Any = SimpleNamespace(declaration={"data": {}})
+    (step,) = _delay(job, late)
+    assert step.words == 'u 1 sample earlier (step = "shift" of data.prepare)'
+    assert step.change == {"data.prepare": [{"step": "shift", "channel": "u", "samples": -1}]}
+    tried = [
+        ProposalErrors(Proposal("the term u", {}), [0.70 * base[0]]),
+        ProposalErrors(step, [0.72 * base[0][:-1]]),
+    ]
+    advice, _ = _conclude_trials(base, tried, rows, 0, False, slow=False)
+    assert [one.text[:10] for one in advice] == ["With u 1 s", "With the t"]
 
 
 CRANE = """

@@ -11,8 +11,10 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import plural
 from orthaug.analysis.filtered_rows import filter_rows
 from orthaug.analysis.memory import MemoryTerm
+from orthaug.analysis.predictability import from_lags
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.motion_task import MotionTask
@@ -33,6 +35,9 @@ _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
 _EXPLAINED = 0.7  # of the output's deviation: what is left above it is not explained by a delay
 _ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
 _ALIKE_AHEAD = 0.05  # of errors ahead, which are those of all rows alike
+_EARLIEST = 2  # samples by which rows may be logged late
+_SEEN_EARLY = 4  # rows of such an input that may still predict what is left
+_FOLLOWED = 0.02  # of what is left, that they predict: the input acts at once instead
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -192,7 +197,8 @@ class LateInput:
     """An input that acts later than in the equations: by a delay, or through a first-order lag.
 
     The residuals of the physics with the best of each, and as declared, are in deviations of the
-    outputs. A lag's time constant is in samples.
+    outputs. A lag's time constant is in samples. A negative delay is an input that acts earlier
+    than recorded; no lag is set beside it.
     """
 
     input: str
@@ -211,6 +217,13 @@ class LateInput:
         return self.lagged < self.delayed
 
     @property
+    def early(self) -> str:
+        """By how much the input acts earlier than recorded, in words; empty if it does not."""
+        if self.delay >= 0:
+            return ""
+        return f"{'a sample' if self.delay == -1 else plural(-self.delay, 'sample')} earlier"
+
+    @property
     def gain(self) -> str:
         """Gain by the better one, beside the other, in words."""
         late = f"a delay of {self.delay} sample{'s' * (self.delay > 1)}"
@@ -220,6 +233,11 @@ class LateInput:
         error = "the error of physics alone"
         if self.ahead:
             error = "what the past does not predict of the error of physics alone"
+        if self.early:
+            return (
+                f"with its values {self.early} {error} is {self.delayed:.3g} standard deviations "
+                f"of the output instead of {self.declared:.3g}"
+            )
         return (
             f"with {better} {error} is {least:.3g} standard deviations of the output instead of "
             f"{self.declared:.3g} ({more:.3g} with {other})"
@@ -233,12 +251,16 @@ class LateInput:
     @property
     def alike(self) -> bool:
         """True if the data hardly distinguish a lag from a delay."""
+        if self.early:
+            return False
         alike = _ALIKE_AHEAD if self.ahead else _ALIKE
         return abs(self.lagged - self.delayed) < alike * min(self.lagged, self.delayed)
 
     @property
     def manner(self) -> str:
         """How the input acts, in words."""
+        if self.early:
+            return f"{self.early} than recorded"
         by_lag = self.by_lag and not self.alike
         return "through a lag" if by_lag else "later than in the equations"
 
@@ -253,6 +275,13 @@ class LateInput:
             'delay the input by [[data.prepare]] with step = "shift", channel = '
             f'"{self.input}", samples = {self.delay}.'
         )
+        found = f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters."
+        if self.early:
+            remedy = (
+                f"Its rows may be logged late: {late.replace('delay', 'advance', 1)} If it acts on "
+                "an output at once, write that into the equation of the output instead."
+            )
+            return Warning("late_rows", f"{found} {remedy}")
         code = "slow_input" if self.by_lag else "dead_time"
         if self.alike:
             remedy = (
@@ -266,17 +295,17 @@ class LateInput:
                 f"If there is a dead time, {late} If a drive or a sensor is slow, model it in the "
                 "equations."
             )
-        found = f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters."
         return Warning(code, f"{found} {remedy}")
 
 
 def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
-    """Return the inputs that act clearly later than in the equations, and by how much.
+    """Return the inputs that act clearly later than in the equations, or earlier, and by how much.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
     by what lies between; where a delay helps, a lag's time constant is sought in the same way.
     Physics alone is refitted each time from where the nearest one ended. A lag of the input acts
-    on linear physics as one of every sensor.
+    on linear physics as one of every sensor. Where no delay helps, the input is advanced by a
+    sample or two: rows that a logger writes late act so.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -306,7 +335,40 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
                     name, sampling_time, best, delayed(best), slow, lagged(slow), before
                 )
                 found[name] = replace(late, ahead=measure is not residual_of)
+            elif measure is residual_of and not best:
+                early = _advance(fits[number, _delay])
+                if early:
+                    left = delayed(-early)
+                    found[name] = LateInput(name, sampling_time, -early, left, 0, before, before)
     return tuple(found[name] for name in names if name in found)
+
+
+def _advance(fits: _LateFits) -> int:
+    """Return the samples by which an input surely acts earlier than recorded; 0 of none.
+
+    A plant on which the input acts at once resembles that, but then what an advance leaves still
+    follows the input; and a discrete plant may well have no delay.
+    """
+    if fits.task.problem.motion.scheme.discrete:
+        return 0
+    left, early = partial(fits.leaves, residual_of), 0
+    while early < _EARLIEST and left(-early - 1) < left(-early):
+        early += 1
+    clearly = left(-early) < min((1 - _LATE) * left(0), _EXPLAINED)
+    return early if early and clearly and _followed(fits, -early) < _FOLLOWED else 0
+
+
+def _followed(fits: _LateFits, samples: int) -> float:
+    """Return the share of an output's error that an input so changed still predicts."""
+    segmented, free_fit = fits.tried[samples]
+    if free_fit is None:
+        return 1.0
+    errors = _errors(segmented, free_fit)
+    inputs = _by_segment(segmented, np.asarray(segmented.segments.inputs))
+    one = [piece[:, fits.number] for piece in inputs]
+    lags = range(_SEEN_EARLY)
+    outputs = range(errors[0].shape[1])
+    return max(from_lags([e[:, j] for e in errors], [one], lags).sure for j in outputs)
 
 
 def _unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
@@ -329,8 +391,13 @@ def _unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> flo
 def _errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> list[Matrix]:
     """Return a free run's errors (T, ny) in every segment, in deviations of the outputs."""
     errors = np.asarray(free_fit.end.point.errors) / segmented.deviation[:, None]
-    scored = np.moveaxis(np.asarray(segmented.segments.scored), 1, -1).reshape(-1, errors.shape[1])
-    pieces = np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3])
+    return _by_segment(segmented, errors)
+
+
+def _by_segment(segmented: SegmentedMotion, values: np.ndarray) -> list[Matrix]:
+    """Return values (k, T, n, m) at the scored steps of every segment, each (T, n)."""
+    scored = np.moveaxis(np.asarray(segmented.segments.scored), 1, -1).reshape(-1, values.shape[1])
+    pieces = np.moveaxis(values, 3, 1).reshape(-1, *values.shape[1:3])
     return [piece[kept] for piece, kept in zip(pieces, scored, strict=True) if kept.any()]
 
 
@@ -382,9 +449,9 @@ def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
 
 
 def _delay(values: Vector, samples: int) -> Vector:
-    """Return an input later by so many samples; before the record it has its first value."""
-    first = np.full(min(samples, len(values)), values[0])
-    return np.concatenate([first, values])[: len(values)]
+    """Return an input later by so many samples; beyond the record it has the value at its end."""
+    rows = np.arange(len(values))
+    return values[np.clip(rows - samples, 0, len(values) - 1)]
 
 
 def _lag(values: Vector, samples: int) -> Vector:

@@ -14,6 +14,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
+from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
@@ -101,7 +102,7 @@ def _is_biased(result: FitResult) -> bool:
 
 
 def _late_inputs(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield a lag or a delay of each input that acts late: the better, and both where alike."""
+    """Yield a lag or a shift of each input that acts late: the better, and both where alike."""
     for late in result.residuals.late if result.residuals is not None else ():
         kinds = (_lag, _delay) if late.by_lag else (_delay, _lag)
         for kind in kinds if late.alike else kinds[:1]:
@@ -123,7 +124,8 @@ def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
     step = Shift(late.input, late.delay)
     declared = {"step": "shift", "channel": late.input, "samples": late.delay}
     steps = [*job.declaration["data"].get("prepare", []), declared]
-    words = f'{late.input} {plural(late.delay, "sample")} later (step = "shift" of data.prepare)'
+    moved = f"{plural(abs(late.delay), 'sample')} {'later' if late.delay > 0 else 'earlier'}"
+    words = f'{late.input} {moved} (step = "shift" of data.prepare)'
     yield Proposal(words, {"data.prepare": steps}, step=step)
 
 
@@ -309,6 +311,7 @@ _PIECES = 3  # of the training rows, the last of which is held out where there i
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
+_ALIKE = 0.95  # of an error: a step of preparation, which adds no parameter, is named first above
 _CHANCE = (
     " It may be chance: the errors remember each other over much of the record, so that few are "
     "independent."
@@ -507,11 +510,11 @@ def _conclude_trials(
         one
         for one in tried
         if one.pieces is not None
-        and (one.proposal.ahead is not None or _ratio(one.pieces, base).code == "helps")
+        and (one.proposal.ahead is not None or _ratio(one, base).code == "helps")
         and not (one.error > _NO_BETTER and (poor or one.error > _TAMED * before))
     ]
     better: list[ProposalErrors] = []
-    for one in sorted(helps, key=lambda one: one.error):
+    for one in sorted(helps, key=_rank):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
     advice = [
@@ -556,16 +559,27 @@ def _relative_clause(better: int, tried: int) -> str:
     )
 
 
-def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
+def _rank(one: ProposalErrors) -> float:
+    """Return the error by which changes that help are in order."""
+    return one.error * (1.0 if one.proposal.step is None else _ALIKE)
+
+
+def _ratio(one: ProposalErrors, base: Pieces) -> Ratio:
     """Return the ratio of errors to those of the present model, on the rows that both predict.
 
-    With more lags the predictions begin later.
+    With more lags the predictions begin later; with an input's values earlier they end earlier.
     """
-    cut = [
-        (a, b) if a is None or b is None else (a[-min(len(a), len(b)) :], b[-min(len(a), len(b)) :])
-        for a, b in zip(pieces, base, strict=True)
+    assert one.pieces is not None
+    early = getattr(one.proposal.step, "samples", 0) < 0
+
+    def cut(piece: Vector, rows: int) -> Vector:
+        return piece[:rows] if early else piece[-rows:]
+
+    both = [
+        (a, b) if a is None or b is None else (cut(a, rows := min(len(a), len(b))), cut(b, rows))
+        for a, b in zip(one.pieces, base, strict=True)
     ]
-    return Ratio.of([a for a, _ in cut], [b for _, b in cut])
+    return Ratio.of([a for a, _ in both], [b for _, b in both])
 
 
 def _may_be_chance(one: ProposalErrors, before: float) -> bool:
