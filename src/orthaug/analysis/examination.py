@@ -33,7 +33,7 @@ from orthaug.analysis.validation import (
     score_trial,
     trials_of,
 )
-from orthaug.data.gaps import saturation_warnings
+from orthaug.data.gaps import saturated_outputs
 from orthaug.data.preparation import of_free_run
 from orthaug.data.record import Record
 from orthaug.data.scales import describe_scales
@@ -144,8 +144,8 @@ def _limits_described(record: Record, free_run: Response) -> list[Warning]:
     """Return the warnings on limits of outputs that the free run reaches as the data do."""
     if not record.complete or len(free_run.model) != len(record):
         return []
-    left = saturation_warnings(record, free_run.model)
-    return [warning for warning in saturation_warnings(record) if warning not in left]
+    left = saturated_outputs(record, free_run.model)
+    return [one.warning for one in saturated_outputs(record) if one not in left]
 
 
 def _analyse(

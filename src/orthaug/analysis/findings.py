@@ -327,6 +327,7 @@ class AdviceResult(Content):
 
     `change` has the new values by their keys, `before` and `after` the RMS errors in standard
     deviations of the training output; `before` is None where the model as it is diverges.
+    Both are None of a change that comes first but cannot be tried.
     """
 
     change: dict[str, Any]
