@@ -384,6 +384,10 @@ def test_an_input_that_is_logged_late_is_advised_before_a_term_of_the_same_error
     (step,) = _delay(job, late)
     assert step.words == 'u 1 sample earlier (step = "shift" of data.prepare)'
     assert step.change == {"data.prepare": [{"step": "shift", "channel": "u", "samples": -1}]}
+    job = SimpleNamespace(declaration={"data": {"prepare": step.change["data.prepare"]}})
+    (further,) = _delay(job, late.model_copy(update={"delay": 0.4}))
+    assert further.words == 'u 0.4 samples later (step = "shift" of data.prepare)'
+    assert further.change["data.prepare"] == [{"step": "shift", "channel": "u", "samples": -0.6}]
     tried = [
         ProposalErrors(Proposal("the term u", {}), [0.70 * base[0]]),
         ProposalErrors(step, [0.72 * base[0][:-1]]),

@@ -187,11 +187,11 @@ class MissingResult(Content):
 
 
 class LateInputResult(Content):
-    """An input that acts later than in the equations, with what each way leaves."""
+    """An input that acts later or earlier than in the equations, with what each way leaves."""
 
     input: str
-    delay: int
-    """Samples."""
+    delay: int | float
+    """Samples, such as 2 or 2.4; negative of an input that acts earlier than recorded."""
     delayed: Number
     time_constant: Number
     """Of a first-order lag, in s."""

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy.optimize
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
@@ -35,6 +36,9 @@ _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
 _EXPLAINED = 0.7  # of the output's deviation: what is left above it is not explained by a delay
 _ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
 _ALIKE_AHEAD = 0.05  # of errors ahead, which are those of all rows alike
+_FINER = 0.1  # lower than by a delay of whole samples: by a part of one more or less
+_PART = 0.1  # of a sample, to which a delay is refined
+_REFINED = 8  # fits for that, at most
 _EARLIEST = 2  # samples by which rows may be logged late
 _SEEN_EARLY = 4  # rows of such an input that may still predict what is left
 _FOLLOWED = 0.02  # of what is left, that they predict: the input acts at once instead
@@ -203,7 +207,7 @@ class LateInput:
 
     input: str
     sampling_time: float
-    delay: int
+    delay: float
     delayed: float
     lag: int
     lagged: float
@@ -226,7 +230,7 @@ class LateInput:
     @property
     def gain(self) -> str:
         """Gain by the better one, beside the other, in words."""
-        late = f"a delay of {self.delay} sample{'s' * (self.delay > 1)}"
+        late = f"a delay of {plural(self.delay, 'sample')}"
         slow = f"a first-order lag of {self.time_constant:.3g} s"
         pairs = [(slow, self.lagged), (late, self.delayed)]
         (better, least), (other, more) = pairs if self.by_lag else pairs[::-1]
@@ -238,9 +242,10 @@ class LateInput:
                 f"with its values {self.early} {error} is {self.delayed:.3g} standard deviations "
                 f"of the output instead of {self.declared:.3g}"
             )
+        beside = f" ({more:.3g} with {other})" if self.lag else ""
         return (
             f"with {better} {error} is {least:.3g} standard deviations of the output instead of "
-            f"{self.declared:.3g} ({more:.3g} with {other})"
+            f"{self.declared:.3g}{beside}"
         )
 
     @property
@@ -302,7 +307,8 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
     """Return the inputs that act clearly later than in the equations, or earlier, and by how much.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
-    by what lies between; where a delay helps, a lag's time constant is sought in the same way.
+    by what lies between, and by a part of a sample where that lowers the error further; where a
+    delay helps, a lag's time constant is sought in the same way.
     Physics alone is refitted each time from where the nearest one ended. A lag of the input acts
     on linear physics as one of every sensor. Where no delay helps, the input is advanced by a
     sample or two: rows that a logger writes late act so.
@@ -328,19 +334,41 @@ def find_late_inputs(task: MotionTask, solver: Any) -> tuple[LateInput, ...]:
             delayed, lagged = (
                 partial(fits[number, change].leaves, measure) for change in (_delay, _lag)
             )
-            best, before = _lowest_argument(delayed, most), measure(*declared)
+            whole, before = _lowest_argument(delayed, most), measure(*declared)
+            best = _refine(fits[number, _delay], delayed, whole, before)
             if delayed(best) < min((1 - _LATE) * before, _EXPLAINED):
                 slow = _lowest_argument(lagged, most)
                 late = LateInput(
                     name, sampling_time, best, delayed(best), slow, lagged(slow), before
                 )
                 found[name] = replace(late, ahead=measure is not residual_of)
-            elif measure is residual_of and not best:
+            elif measure is residual_of and not whole:
                 early = _advance(fits[number, _delay])
                 if early:
                     left = delayed(-early)
                     found[name] = LateInput(name, sampling_time, -early, left, 0, before, before)
     return tuple(found[name] for name in names if name in found)
+
+
+def _refine(fits: _LateFits, leaves: Callable[[float], float], whole: int, before: float) -> float:
+    """Return a delay in whole samples, or with a part of one where that surely leaves less.
+
+    A part of a sample resembles missing physics, so that what it leaves must not follow the input,
+    and, below one, another hold.
+    """
+    motion = fits.task.problem.motion
+    if motion.scheme.discrete or (not whole and motion.hold != "zero-order"):
+        return whole
+    near = [whole + 0.5, *([whole - 0.5] if whole else [])]
+    if min(map(leaves, [whole, *near])) >= min((1 - _LATE) * before, _EXPLAINED):
+        return whole
+    around = (max(whole - 1, 0), whole + 1)
+    options = {"xatol": _PART / 2, "maxiter": _REFINED}
+    found = scipy.optimize.minimize_scalar(leaves, bounds=around, method="bounded", options=options)
+    best = round(round(float(found.x) / _PART) * _PART, 10)
+    if leaves(best) >= (1 - _FINER) * leaves(whole):
+        return whole
+    return best if _followed(fits, best) < _FOLLOWED else whole
 
 
 def _advance(fits: _LateFits) -> int:
@@ -358,7 +386,7 @@ def _advance(fits: _LateFits) -> int:
     return early if early and clearly and _followed(fits, -early) < _FOLLOWED else 0
 
 
-def _followed(fits: _LateFits, samples: int) -> float:
+def _followed(fits: _LateFits, samples: float) -> float:
     """Return the share of an output's error that an input so changed still predicts."""
     segmented, free_fit = fits.tried[samples]
     if free_fit is None:
@@ -408,12 +436,12 @@ class _LateFits:
     task: MotionTask
     solver: Any
     number: int
-    change: Callable[[Vector, int], Vector]
+    change: Callable[[Vector, float], Vector]
     """Of an input's values, by so many samples."""
-    tried: dict[int, tuple[SegmentedMotion, FreeRunFit | None]]
+    tried: dict[float, tuple[SegmentedMotion, FreeRunFit | None]]
     """Where each size ended; none is there from the start."""
 
-    def leaves(self, measure: Measure, samples: int) -> float:
+    def leaves(self, measure: Measure, samples: float) -> float:
         """Return what the physics leaves with the input changed by so many samples."""
         if samples not in self.tried:
             ended = [known for known, (_, free_fit) in self.tried.items() if free_fit is not None]
@@ -424,7 +452,7 @@ class _LateFits:
             self.tried[samples] = refit_physics(self.task, begin, problem.motion, late, self.solver)
         return measure(*self.tried[samples])
 
-    def _late(self, record: Record, samples: int) -> Record:
+    def _late(self, record: Record, samples: float) -> Record:
         """Return the record with the input changed in every experiment."""
 
         def late(inputs: np.ndarray) -> np.ndarray:
@@ -436,7 +464,7 @@ class _LateFits:
         )
 
 
-def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
+def _lowest_argument(leaves: Callable[[float], float], most: int) -> int:
     """Return the argument from 0 on at which a function that falls and then rises is least."""
     best, step = 0, 1
     while step <= most and leaves(step) < leaves(best):
@@ -448,12 +476,12 @@ def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
     return best
 
 
-def _delay(values: Vector, samples: int) -> Vector:
+def _delay(values: Vector, samples: float) -> Vector:
     """Return an input later by so many samples; beyond the record it has the value at its end."""
     rows = np.arange(len(values))
-    return values[np.clip(rows - samples, 0, len(values) - 1)]
+    return np.interp(rows - samples, rows, values)
 
 
-def _lag(values: Vector, samples: int) -> Vector:
+def _lag(values: Vector, samples: float) -> Vector:
     """Return an input behind a first-order lag whose time constant is so many samples."""
     return MemoryTerm("lag", "input", float(samples)).along(values, 1.0)

@@ -163,8 +163,11 @@ def _lag(job: Job, late: LateInputResult) -> Iterator[Proposal]:
 def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
     """Yield a shift of an input in the preparation of the data."""
     step = Shift(late.input, late.delay)
-    declared = {"step": "shift", "channel": late.input, "samples": late.delay}
-    steps = [*job.declaration["data"].get("prepare", []), declared]
+    steps = [dict(one) for one in job.declaration["data"].get("prepare", [])]
+    if steps and steps[-1]["step"] == "shift" and steps[-1]["channel"] == late.input:
+        steps[-1]["samples"] = round(steps[-1]["samples"] + late.delay, 10)
+    else:
+        steps.append({"step": "shift", "channel": late.input, "samples": late.delay})
     moved = f"{plural(abs(late.delay), 'sample')} {'later' if late.delay > 0 else 'earlier'}"
     words = f'{late.input} {moved} (step = "shift" of data.prepare)'
     yield Proposal(words, {"data.prepare": steps}, step=step)
