@@ -17,6 +17,7 @@ from test_motion_cli import friction, orthaug
 
 import orthaug as oa
 from orthaug._base.errors import Warning as FoundWarning
+from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.findings import LateInputResult
 from orthaug.commands.advice import (
     Proposal,
@@ -432,6 +433,27 @@ def test_the_step_that_a_warning_names_is_a_proposal():
     assert angle.step == oa.Unwrap(360.0, ("y",)) and "cannot be compared" in angle.untried
     assert recorded(swing) == []
     assert recorded(np.minimum(swing, 0.5), known=False) == []
+
+
+def test_exchanged_columns_are_the_first_advice():
+    """No term, and no other hold, mends an output that is read as the input."""
+    rng = np.random.default_rng(7)
+    force, x = rng.uniform(-1, 1, 900), np.zeros(900)
+    for k in range(899):
+        x[k + 1] = 0.9 * x[k] + 0.1 * force[k]
+    record = oa.Record.from_arrays(u=x + 0.001 * rng.normal(size=900), y=force)
+    (warning,) = closed_loop(record, "motion")
+    job: Any = SimpleNamespace(
+        train=SimpleNamespace(record=record, source=None),
+        physics=SimpleNamespace(section="motion"),
+        declaration={"data": {"channels": {"u": {"unit": "N"}}}},
+    )
+    result: Any = SimpleNamespace(warnings=[warning])
+    (found,) = mending_proposals(job, result)
+    assert found.words == "the columns of u and y exchanged" and found.untried
+    channels = apply_change(job.declaration, found.change)["data"]["channels"]
+    assert channels == {"u": {"unit": "N", "column": "y"}, "y": {"column": "u"}}
+    assert mending_proposals(job, SimpleNamespace(warnings=[])) == []  # type: ignore[arg-type]
 
 
 def test_a_noise_model_is_the_first_advice_where_the_free_run_is_no_better():

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.budget import Budget
-from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.closed_loop import closed_loop, without_exchanged
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.evidence import Evidence
@@ -171,7 +171,8 @@ def _analyse(
         warnings += [one for one in fit.warnings if one not in plain.warnings]
         if fit.std is not None:  # the robust ones need no covariance of the weights
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
-        warnings += closed_loop(evidence.train.record, evidence.method(fit.criterion))
+        looped = closed_loop(evidence.train.record, evidence.method(fit.criterion))
+        warnings[:] = [*without_exchanged(warnings, looped), *looped]
         warnings += few_frequencies(evidence.train.record, len(fit.problem.names))
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")

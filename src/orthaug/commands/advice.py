@@ -19,6 +19,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
+from orthaug.analysis.closed_loop import exchanged_with_output
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult, LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, declared_output
@@ -73,6 +74,8 @@ def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
     record, found = job.train.record, []
     known = {(warning.code, warning.text) for warning in result.warnings}
     motion = job.physics.section == "motion"
+    if any(warning.code == "exchanged_columns" for warning in result.warnings):
+        found += _exchange(job)
     for mending in mendings(record) if job.train.source is None else ():
         name, output = mending.step["step"], mending.output
         if tuple(mending.warning) not in known or (name == "repeats" and not motion):
@@ -90,6 +93,20 @@ def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
         words = f'{which} of {output} marked as missing (step = "{name}" of data.prepare)'
         found.append(Proposal(words, change, step=step, mends=True))
     return found
+
+
+def _exchange(job: Job) -> Iterator[Proposal]:
+    """Yield the columns of the only output and of an input that seems to be its cause exchanged."""
+    record = job.train.record
+    name, output = exchanged_with_output(record), record.outputs[0]
+    given = next((channel for channel in record.inputs if channel.name == name), None)
+    if given is not None:
+        change = {
+            f"data.channels.{name}.column": output.file_column,
+            f"data.channels.{output.name}.column": given.file_column,
+        }
+        words = f"the columns of {name} and {output.name} exchanged"
+        yield Proposal(words, change, untried=_OTHER_OUTPUT)
 
 
 def _noise_model(fit: Any, result: FitResult) -> list[Proposal]:

@@ -348,6 +348,7 @@ _UNTESTED = {
     "parameter_drift": "a parameter changes over its record",
     "differs_between_experiments": "its parameters differ between the experiments",
     "held_output": "a sensor is slower than the rows of its data",
+    "exchanged_columns": "an input and an output may be exchanged",
     "saturated_output": "an output is recorded at an end of its range",
     "wild_rows": "a few rows, which may be wrong, decide its parameters",
     "short_for_noise": "its record is too short to distinguish noise from disturbances that last",
