@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.optimize
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
@@ -356,6 +355,8 @@ def _refine(fits: _LateFits, leaves: Callable[[float], float], whole: int, befor
     A part of a sample resembles missing physics, so that what it leaves must not follow the input,
     and, below one, another hold.
     """
+    from scipy.optimize import minimize_scalar
+
     motion = fits.task.problem.motion
     if motion.scheme.discrete or (not whole and motion.hold != "zero-order"):
         return whole
@@ -364,7 +365,7 @@ def _refine(fits: _LateFits, leaves: Callable[[float], float], whole: int, befor
         return whole
     around = (max(whole - 1, 0), whole + 1)
     options = {"xatol": _PART / 2, "maxiter": _REFINED}
-    found = scipy.optimize.minimize_scalar(leaves, bounds=around, method="bounded", options=options)
+    found = minimize_scalar(leaves, bounds=around, method="bounded", options=options)
     best = round(round(float(found.x) / _PART) * _PART, 10)
     if leaves(best) >= (1 - _FINER) * leaves(whole):
         return whole
