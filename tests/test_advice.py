@@ -6,6 +6,7 @@ import html
 import json
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,23 @@ from helpers import unfolded
 from test_motion_cli import friction, orthaug
 
 import orthaug as oa
+from orthaug._base.errors import Warning as FoundWarning
+from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.findings import LateInputResult
 from orthaug.commands.advice import (
     Proposal,
     ProposalErrors,
     ValidationRows,
     _conclude_trials,
+    _delay,
+    _noise_model,
     _unique_proposals,
     apply_change,
+    mending_proposals,
 )
 from orthaug.commands.motion import _has_term
+from orthaug.data.wild import mendings
+from orthaug.fitting.held_out import Candidate, Focus
 from orthaug.reports.page_verdict import fit_verdict
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -356,6 +365,149 @@ def test_a_much_lower_error_without_sure_gain_says_why():
     )
     assert not advice, advice
     assert "lower, but not surely on other rows" in trials.text
+
+
+def test_an_input_that_is_logged_late_is_advised_before_a_term_of_the_same_error():
+    """The step adds no parameter; its rows end a sample before those of the present model."""
+    rng = np.random.default_rng(3)
+    base = [1e-3 * rng.normal(size=200) ** 8]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    late = LateInputResult(
+        input="u",
+        delay=-1,
+        delayed=0.02,
+        time_constant=0.0,
+        lagged=0.1,
+        declared=0.1,
+        by_lag=False,
+        alike=False,
+    )
+    job: Any = SimpleNamespace(declaration={"data": {}})
+    (step,) = _delay(job, late)
+    assert step.words == 'u 1 sample earlier (step = "shift" of data.prepare)'
+    assert step.change == {"data.prepare": [{"step": "shift", "channel": "u", "samples": -1}]}
+    job = SimpleNamespace(declaration={"data": {"prepare": step.change["data.prepare"]}})
+    (further,) = _delay(job, late.model_copy(update={"delay": 0.4}))
+    assert further.words == 'u 0.4 samples later (step = "shift" of data.prepare)'
+    assert further.change["data.prepare"] == [{"step": "shift", "channel": "u", "samples": -0.6}]
+    tried = [
+        ProposalErrors(Proposal("the term u", {}), [0.70 * base[0]]),
+        ProposalErrors(step, [0.72 * base[0][:-1]]),
+    ]
+    advice, _ = _conclude_trials(base, tried, rows, 0, False, slow=False)
+    assert [one.text[:10] for one in advice] == ["With u 1 s", "With the t"]
+
+
+def recorded(y: np.ndarray, section: str = "motion", known: bool = True) -> list[Proposal]:
+    """What is proposed for an output so recorded, if its warnings are in the result."""
+    record = oa.Record.from_arrays(np.zeros(len(y)), y)
+    job: Any = SimpleNamespace(
+        train=SimpleNamespace(record=record, source=None),
+        physics=SimpleNamespace(section=section),
+        declaration={"data": {"prepare": [{"step": "detrend"}]}},
+    )
+    warnings = [one.warning for one in mendings(record)] if known else []
+    result: Any = SimpleNamespace(warnings=warnings)
+    return mending_proposals(job, result)
+
+
+def test_the_step_that_a_warning_names_is_a_proposal():
+    """With the keys of the spec, behind the steps that it has; of an unknown warning there is none."""
+    noise = 0.01 * np.random.default_rng(4).normal(size=900)
+    swing = np.sin(0.02 * np.arange(900)) + noise
+    (limited,) = recorded(np.minimum(swing, 0.5))
+    step = {"step": "limits", "high": 0.5, "channels": ["y"]}
+    assert limited.change == {
+        "data.prepare": [{"step": "detrend"}, step],
+        "data.missing": "keep",
+    }
+    assert limited.mends and limited.step == oa.Limits(high=0.5, channels=("y",))
+    assert (
+        limited.words == 'samples at 0.5 of y marked as missing (step = "limits" of data.prepare)'
+    )
+    (lagged,) = recorded(np.minimum(swing, 0.5), "baseline")
+    assert "data.missing" not in lagged.change
+    (held,) = recorded(np.repeat(swing[::10], 10))
+    assert held.step == oa.Repeats(("y",)) and held.change["data.missing"] == "keep"
+    assert recorded(np.repeat(swing[::10], 10), "baseline") == []  # its lags need every row
+    (angle,) = recorded(np.mod(0.7 * np.arange(900), 360) + noise)
+    assert angle.step == oa.Unwrap(360.0, ("y",)) and "cannot be compared" in angle.untried
+    assert recorded(swing) == []
+    assert recorded(np.minimum(swing, 0.5), known=False) == []
+
+
+def test_exchanged_columns_are_the_first_advice():
+    """No term, and no other hold, mends an output that is read as the input."""
+    rng = np.random.default_rng(7)
+    force, x = rng.uniform(-1, 1, 900), np.zeros(900)
+    for k in range(899):
+        x[k + 1] = 0.9 * x[k] + 0.1 * force[k]
+    record = oa.Record.from_arrays(u=x + 0.001 * rng.normal(size=900), y=force)
+    (warning,) = closed_loop(record, "motion")
+    job: Any = SimpleNamespace(
+        train=SimpleNamespace(record=record, source=None),
+        physics=SimpleNamespace(section="motion"),
+        declaration={"data": {"channels": {"u": {"unit": "N"}}}},
+    )
+    result: Any = SimpleNamespace(warnings=[warning])
+    (found,) = mending_proposals(job, result)
+    assert found.words == "the columns of u and y exchanged" and found.untried
+    channels = apply_change(job.declaration, found.change)["data"]["channels"]
+    assert channels == {"u": {"unit": "N", "column": "y"}, "y": {"column": "u"}}
+    assert mending_proposals(job, SimpleNamespace(warnings=[])) == []  # type: ignore[arg-type]
+
+
+def test_a_noise_model_is_the_first_advice_where_the_free_run_is_no_better():
+    """The text asked for training on the free run, which the fit had just tried and refused."""
+
+    def proposed(*tried: str, code: str = "inconsistent") -> list[Proposal]:
+        compared = tuple(Candidate(focus, False, 0.3) for focus in tried)
+        fit: Any = SimpleNamespace(focus=Focus("prediction", "", compared) if tried else None)
+        result: Any = SimpleNamespace(warnings=[FoundWarning(code, "")])
+        return _noise_model(fit, result)
+
+    (found,) = proposed("prediction", "simulation")
+    assert found.change == {"noise.model": "auto"} and found.untried
+    assert not proposed("prediction") and not proposed()
+    assert not proposed("prediction", "simulation", code="biased")
+
+
+FILLED = """
+[data]
+sampling_time = 0.1
+inputs = ["u"]
+outputs = ["h"]
+train = { files = ["run.csv"] }
+[motion.states]
+x = { derivative = "(K*u - x)/T", start = "h" }
+[motion.outputs]
+h = "x"
+[motion.parameters]
+K = { initial = 1, min = 0 }
+T = { initial = 1, min = 0 }
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", [False, True], ids=["sensor", "plant"])
+def test_the_range_of_a_sensor_is_advised_before_terms_that_bend(tmp_path, plant: bool):
+    """A term x*abs(x) was advised. Of a plant that ends there, the other samples gain by a term."""
+    rng, kept = np.random.default_rng(6), np.exp(-0.1 / 0.5)
+    u = np.repeat(rng.uniform(-1, 1, 45), 20)
+    x = np.zeros(900)
+    for k in range(899):
+        x[k + 1] = kept * x[k] + (1 - kept) * 2 * u[k]
+        x[k + 1] = min(x[k + 1], 0.8) if plant else x[k + 1]
+    h = np.minimum(x + (0 if plant else 0.02 * rng.normal(size=900)), 0.8)
+    spec = put(tmp_path, FILLED, np.column_stack([u, h]), "u,h")
+    result = oa.fit_spec(str(spec)).result
+    first = result.advice[0] if result.advice else None
+    named = first is not None and "samples at 0.8 of h marked as missing" in first.text
+    assert named == (not plant), result.advice_trials
+    if not plant:
+        assert first is not None and first.after < 0.3 * first.before
+        assert len(result.advice) == 1 and result.advice_trials.not_tried > 0
 
 
 CRANE = """

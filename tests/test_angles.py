@@ -9,7 +9,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
-from orthaug.data.angles import find_resets, find_wrap, reset_warnings, wrap_warnings
+from orthaug.data.angles import find_resets, find_wrap, reset_warnings, wrapped_angles
 
 
 def turning(rows: int = 600) -> np.ndarray:
@@ -28,12 +28,14 @@ def test_an_angle_that_wraps_is_named_and_unwrapped(period, share):
     angle = turning()
     y = wrapped(angle, period, share * period)
     record = oa.Record.from_arrays(np.zeros(len(y)), y, sampling_time=0.02, outputs=["angle"])
-    (found,) = wrap_warnings(record)
-    assert found.code == "wrapped_angle" and f"period = {period:.10g}`" in found.text
+    (found,) = wrapped_angles(record)
+    assert found.warning.code == "wrapped_angle"
+    assert f"period = {period:.10g}`" in found.warning.text
+    assert found.step["period"] == pytest.approx(period) and found.step["channels"] == ["angle"]
     right = oa.prepare(record, oa.Unwrap(period, ("angle",)))
     moved = right.experiments[0].outputs.ravel() - angle * period / 360
     assert np.ptp(moved) < 1e-9 * period
-    assert not wrap_warnings(right)
+    assert not wrapped_angles(right)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +60,7 @@ def test_gaps_are_unwrapped_across():
     y = wrapped(turning(), 360.0, -180.0)
     y[[40, 41, 300]] = np.nan
     record = oa.Record.from_arrays(np.zeros(len(y)), y, sampling_time=0.02, missing="keep")
-    assert wrap_warnings(record)
+    assert wrapped_angles(record)
     right = oa.prepare(record, oa.Unwrap(360.0, ("y",)), missing="keep")
     values = right.experiments[0].outputs.ravel()
     assert np.isnan(values).sum() == 3 and not np.isnan(np.unwrap(values[45:290], period=360)).any()

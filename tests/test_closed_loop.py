@@ -10,7 +10,13 @@ import scipy.signal as ss
 from test_cli import run, write_csv
 
 from orthaug import Record
-from orthaug.analysis.closed_loop import closed_loop, feedback_in
+from orthaug._base.errors import Warning
+from orthaug.analysis.closed_loop import (
+    closed_loop,
+    exchanged_with_output,
+    feedback_in,
+    without_exchanged,
+)
 
 ROWS = 1500
 
@@ -89,6 +95,38 @@ def test_a_controller_is_found(noise, gain):
         "two stages: record the reference" in warning.text
         and "white in the equation" in warning.text
     )
+
+
+@pytest.mark.parametrize("kind", ["white", "slow", "walk", "three levels", "steps with noise"])
+def test_an_output_that_is_read_as_the_input_is_no_feedback(kind):
+    """It was called feedback, with the advice to record a reference that there is not."""
+    rng = np.random.default_rng(0)
+    u, y = plant(INPUTS[kind](rng), rng, 0.05)
+    record = Record.from_arrays(u=y, y=u)
+    (warning,) = closed_loop(record)
+    assert warning.code == "exchanged_columns" and exchanged_with_output(record) == "u"
+    assert "past u does not predict y: the columns of both may be exchanged" in warning.text
+    held = Warning("held_output", "its sensor is slower than the rows")  # an input is often held
+    assert without_exchanged([held], [warning]) == []
+    assert without_exchanged([held], [Warning("closed_loop", "")]) == [held]
+
+
+@pytest.mark.parametrize("gain", [0.3, 1.0])
+def test_feedback_is_not_taken_for_exchanged_columns(gain):
+    """Of 365 loops that were found, one was (references, noises, slow sensors, integral action)."""
+    found = []
+    for seed in range(4):
+        for noise in (0.01, 0.1, 0.5):
+            for reference in (
+                lambda rng: held(rng, 25),
+                lambda rng: held(rng, 400),
+                INPUTS["slow"],
+            ):
+                rng = np.random.default_rng(seed)
+                u, y = plant(reference(rng), rng, noise, gain)
+                for measured in (y, np.repeat(y[::10], 10)):
+                    found += [one.code for one in closed_loop(Record.from_arrays(u, measured))]
+    assert len(found) > 20 and found.count("exchanged_columns") <= 1
 
 
 @pytest.mark.parametrize("rows", [3, 30, 120])

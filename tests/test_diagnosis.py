@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -30,6 +31,7 @@ from orthaug import (
 from orthaug.analysis.findings import DiagnosisResult
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.verdict_text import _shares
+from orthaug.fitting.held_out import Candidate, Focus
 from orthaug.fitting.inconsistency import inconsistency
 
 estimate = partial(estimate, standard_errors="plain")  # robust ones are asked for here
@@ -337,6 +339,12 @@ def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
         and "standard errors away" in told
         and 'focus = "simulation"' in told
     )
+    compared = tuple(Candidate(focus, False, 0.3) for focus in ("prediction", "simulation"))
+    fit = estimate(Record.from_arrays(u, y), PHYSICS, learner=None, criterion=Prediction())
+    after = diagnose(replace(fit, focus=Focus("prediction", "", compared)))
+    told = dict(after.warnings)["inconsistent"]  # the free run was no better: not advised again
+    assert 'focus = "simulation"' not in told
+    assert 'a noise model ([noise] model = "auto"): training on the free run was tried' in told
     assert not any("one-step θ" in warning.text for warning in two.warnings)
     assert of(second_order(0, equation=0.1)).warnings == ()
 

@@ -44,3 +44,73 @@ def test_a_delay_is_found_beside_a_slow_disturbance(delay):
     assert found.ahead
     assert (found.input, found.delay, found.by_lag, found.alike) == ("power", 3, False, False)
     assert found.delayed < 0.6 * found.declared
+
+
+STEP, KEPT = 0.05, float(np.exp(-0.05 / 0.3 / 10))  # s; of the state, over a tenth of it
+FIRST_ORDER = {
+    "outputs": [oa.Output("y", "x")],
+    "inputs": ["u"],
+    "parameters": [oa.PhysicalParameter("K", 1.0, min=0), oa.PhysicalParameter("T", 1.0, min=0)],
+}
+LAG = oa.Motion.from_equations(
+    states=[oa.State("x", "(K*u - x)/T", start="y")],
+    **FIRST_ORDER,
+)
+STEPS = oa.Motion.from_equations(
+    states=[oa.State("x", "x + (K*u - x)*0.05/T", start="y")], integrator="discrete", **FIRST_ORDER
+)
+
+
+def logged(delay=0.0, at_once=0.0, rows=800):
+    """A lag of gain 2 on which u acts so many samples late, and `at_once` times u in its output."""
+    rng, spare = np.random.default_rng(0), 5
+    u = np.repeat(rng.uniform(0, 5, rows // 10 + 2), 10)[: rows + 2 * spare]
+    tenths = np.arange(10 * len(u)) - round(10 * delay)
+    acting = u[np.clip(tenths // 10, 0, len(u) - 1)]
+    x = np.full(len(acting), 2 * u[0])
+    for k in range(len(acting) - 1):
+        x[k + 1] = KEPT * x[k] + (1 - KEPT) * 2 * acting[k]
+    y = x[::10] + at_once * u + 0.05 * rng.normal(size=len(u))
+    kept = slice(spare, spare + rows)
+    return oa.Record.from_arrays(u[kept], y[kept], sampling_time=STEP, inputs=["u"], outputs=["y"])
+
+
+@pytest.mark.parametrize("late", [1, 2])
+def test_an_input_that_is_logged_late_is_moved_back(late):
+    """A term u in the output has the same error, but its gain is wrong by 15 % (K 1.7 for 2)."""
+    found = oa.estimate(logged(-late), LAG, learner=None).diagnose()
+    (early,) = found.residuals.late
+    assert (early.delay, early.by_lag, early.alike, early.time_constant) == (-late, False, False, 0)
+    assert early.delayed < 0.03 < 0.1 < early.declared
+    word = {1: "a sample", 2: "2 samples"}[late]
+    assert f"u acts {word} earlier than recorded: with its values" in found.residuals.text
+    (warned,) = [warning for warning in found.warnings if warning.code == "late_rows"]
+    assert f"samples = {-late}." in warned.text and "logged late: advance" in warned.text
+
+
+@pytest.mark.parametrize("delay", [0.4, 2.4, 2])
+def test_a_dead_time_is_found_to_a_tenth_of_a_sample(delay):
+    """Of 2.4 samples 2 were found, and the rest was taken for a missing term."""
+    found = oa.estimate(logged(delay), LAG, learner=None).diagnose()
+    (late,) = found.residuals.late
+    assert late.delay == pytest.approx(delay, abs=1e-9) and not late.by_lag
+    assert f"a delay of {delay} samples the error" in found.residuals.text
+    right = oa.prepare(logged(delay), oa.Shift("u", late.delay))
+    fit = oa.estimate(right, LAG, learner=None)
+    assert fit.parameters.loc["K", "value"] == pytest.approx(2, rel=2e-3)
+    assert fit.parameters.loc["T", "value"] == pytest.approx(0.3, rel=2e-2)
+    assert fit.diagnose().residuals.late == []
+
+
+@pytest.mark.parametrize("at_once", [0.0, 0.2, 0.6, -0.2])
+def test_an_input_that_acts_at_once_is_not_moved(at_once):
+    """An advance imitates 0.31 of u in the output alone; beside others it leaves a trace of u."""
+    found = oa.estimate(logged(0, at_once), LAG, learner=None).diagnose().residuals
+    assert [late for late in found.late if late.delay < 1] == []
+    assert ("rows may be logged late" in found.text) == bool(at_once)
+
+
+def test_a_discrete_plant_without_delay_is_not_moved():
+    """Its equations have u act a sample later; that it acts at once is no fault of the logger."""
+    found = oa.estimate(logged(-1), STEPS, learner=None).diagnose().residuals
+    assert found.verdict == "unmodelled" and found.late == []

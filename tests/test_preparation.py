@@ -123,6 +123,11 @@ def test_an_input_is_shifted():
         e = oa.prepare(record(u, u), oa.Shift("u", samples)).experiments[0]
         assert len(e) == 997 and np.all(e.outputs[:, 0] - e.inputs[:, 0] == samples)
         assert e.first_row == max(samples, 0)
+    for samples, rows, first in ((2.4, 997, 3), (-0.3, 999, 0), (0.3, 999, 1), (-2.4, 997, 0)):
+        e = oa.prepare(record(u, u), oa.Shift("u", samples)).experiments[0]
+        assert (len(e), e.first_row) == (rows, first)
+        assert e.outputs[:, 0] - e.inputs[:, 0] == pytest.approx(samples)
+    assert oa.Shift("u", 2.0) == oa.Shift("u", 2) and isinstance(oa.Shift("u", 2.0).samples, int)
 
 
 def test_uneven_time_stamps_get_an_even_grid(tmp_path):
@@ -194,7 +199,10 @@ REFUSED = [
         lambda: oa.prepare(record(SLOW), oa.Shift("u", 1000)),
         "has 1000 rows, too few to be shifted by 1000",
     ),
-    (lambda: oa.prepare(record(SLOW), oa.Shift("u", 1.5)), "`samples` must be a whole number"),
+    (
+        lambda: oa.prepare(record(SLOW), oa.Shift("u", float("nan"))),
+        "`samples` must be a finite number",
+    ),
     (lambda: oa.prepare(record(SLOW), oa.Resample(sampling_time=1e-9)), "take a longer one"),
     (
         lambda: oa.prepare(record(SLOW).rows(0, 9), oa.Lowpass(cutoff=1.0)),

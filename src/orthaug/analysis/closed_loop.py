@@ -6,6 +6,7 @@ reference and the disturbances into it (Granger 1969; Söderström and Stoica 19
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,9 @@ _ROWS_PER_COLUMN = 5
 _MOST = 20_000
 _NOTHING = 1e-3  # of an input's deviation: what its own past leaves is then no surprise
 _RANK = 1e-10
+_EXCHANGED = 0.1  # of an input, by past outputs: less is rather weak feedback
+# Of an output, by past inputs: what speaks against an effect of an input
+_NO_EFFECT, _ABSENT = 0.01, 0.1  # level, and the share that there is at most
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
 _ROUNDS = 4
 _SWITCHES = 8  # of an input of two levels, up and down each
@@ -74,6 +78,36 @@ def feedback_in(record: Record) -> tuple[Feedback, ...]:
     return tuple(found)
 
 
+def exchanged_with_output(record: Record) -> str:
+    """Return the input that may be exchanged with the only output; "" for none.
+
+    Past outputs predict it, as under feedback; but then its own past would predict the output.
+    """
+    complete = complete_record(record)
+    if complete is None or len(record.outputs) != 1:
+        return ""
+    for one in feedback_in(complete):
+        j = [channel.name for channel in complete.inputs].index(one.name)
+        follows = one.share > _EXCHANGED and not one.switched_by
+        if follows and _moves_nothing(complete, j):
+            return one.name
+    return ""
+
+
+def _moves_nothing(record: Record, j: int) -> bool:
+    """Return whether the past of input j surely predicts nothing of the only output."""
+    every = (
+        _rows(e.outputs[:, 0], np.delete(e.inputs, j, axis=1), e.inputs[:, [j]])
+        for e in record.experiments
+    )
+    with one_blas_thread():
+        tested = _shares(every)
+    if tested is None:
+        return False
+    share, level = tested
+    return level > _NO_EFFECT and share.value + 2 * share.error < _ABSENT
+
+
 _PAIR = "`controller` and the reference as input"
 _FREE_RUN = (
     "A free run on the measured input is then consistent only with complete physics and white "
@@ -110,6 +144,10 @@ def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
     found = feedback_in(record)
     if not found:
         return ()
+    exchanged = exchanged_with_output(record)
+    if exchanged:
+        share = next(one.share for one in found if one.name == exchanged)
+        return (_exchanged(exchanged, record.outputs[0].name, share),)
     named = ", ".join(
         f"{one.name} ({percent(one.share)} of what its own past leaves)"
         if not one.switched_by
@@ -122,6 +160,22 @@ def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
         f"{_source(found, record)} {_REMEDIES[method]}"
     )
     return (Warning("closed_loop", text),)
+
+
+def _exchanged(name: str, output: str, share: float) -> Warning:
+    text = (
+        f"past {output} predicts {name} ({percent(share)} of what its own past leaves), but past "
+        f"{name} does not predict {output}: the columns of both may be exchanged. Check `column` "
+        f"of their channels. If they are right, {name} follows {output} without an effect on it."
+    )
+    return Warning("exchanged_columns", text)
+
+
+def without_exchanged(warnings: Sequence[Warning], looped: Sequence[Warning]) -> list[Warning]:
+    """Return warnings on a record less those that exchanged columns explain: inputs are held."""
+    if all(one.code != "exchanged_columns" for one in looped):
+        return list(warnings)
+    return [one for one in warnings if one.code != "held_output"]
 
 
 def _source(found: tuple[Feedback, ...], record: Record) -> str:
@@ -185,10 +239,15 @@ def _input_share(record: Record, j: int) -> tuple[float, float] | None:
     every = (
         _rows(e.inputs[:, j], np.delete(e.inputs, j, axis=1), e.outputs) for e in record.experiments
     )
+    return _enough(_shares(every))
+
+
+def _shares(every: Iterable[tuple[Matrix, Matrix, Vector] | None]) -> tuple[Share, float] | None:
+    """Return share and level of a prediction over all experiments; None where it has no test."""
     pieces = [piece for piece in every if piece is not None and len(piece[2])]
     if not pieces:
         return None
-    widths = {(own.shape[1], outputs.shape[1]) for own, outputs, _ in pieces}
+    widths = {(own.shape[1], others.shape[1]) for own, others, _ in pieces}
     if len(widths) > 1:  # some are held and some are not: those of which there are more
         best = max(
             widths,
@@ -197,8 +256,8 @@ def _input_share(record: Record, j: int) -> tuple[float, float] | None:
             ),
         )
         pieces = [p for p in pieces if (p[0].shape[1], p[1].shape[1]) == best]
-    own, outputs, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
-    return predicted_share(own, outputs, target)
+    own, others, target = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+    return _tested_share(own, others, target)
 
 
 def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
@@ -208,6 +267,24 @@ def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float,
 
     None where there are too few rows, `own` leaves nothing, or the share is not surely large
     enough.
+    """
+    return _enough(_tested_share(own, others, target))
+
+
+def _enough(tested: tuple[Share, float] | None) -> tuple[float, float] | None:
+    """Return share and level of a test where the share is surely large enough."""
+    if tested is None:
+        return None
+    share, level = tested
+    if share.value < _SHARE or share.value < _SURE * share.error:
+        return None
+    return share.value, level
+
+
+def _tested_share(own: Matrix, others: Matrix, target: Vector) -> tuple[Share, float] | None:
+    """Return the share of a target that `others` predict beside `own`, and the test's level.
+
+    None where there are too few rows, or `own` leaves nothing.
     """
     usual = _usual(own, target)
     own, others, target = _scale(own[usual]), _scale(others[usual]), target[usual]
@@ -224,9 +301,7 @@ def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float,
     share: Share = sums.share(
         range(base.shape[1], base.shape[1] + others.shape[1]), range(base.shape[1])
     )
-    if share.value < _SHARE or share.value < _SURE * share.error:
-        return None
-    return share.value, _wald(beside, left)
+    return share, _wald(beside, left)
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.budget import Budget
-from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.closed_loop import closed_loop, without_exchanged
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.evidence import Evidence
@@ -33,7 +33,7 @@ from orthaug.analysis.validation import (
     score_trial,
     trials_of,
 )
-from orthaug.data.gaps import saturation_warnings
+from orthaug.data.gaps import saturated_outputs
 from orthaug.data.preparation import of_free_run
 from orthaug.data.record import Record
 from orthaug.data.scales import describe_scales
@@ -148,8 +148,8 @@ def _limits_described(record: Record, free_run: Response) -> list[Warning]:
     """Return the warnings on limits of outputs that the free run reaches as the data do."""
     if not record.complete or len(free_run.model) != len(record):
         return []
-    left = saturation_warnings(record, free_run.model)
-    return [warning for warning in saturation_warnings(record) if warning not in left]
+    left = saturated_outputs(record, free_run.model)
+    return [one.warning for one in saturated_outputs(record) if one not in left]
 
 
 def _analyse(
@@ -175,7 +175,8 @@ def _analyse(
         warnings += [one for one in fit.warnings if one not in plain.warnings]
         if fit.std is not None:  # the robust ones need no covariance of the weights
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
-        warnings += closed_loop(evidence.train.record, evidence.method(fit.criterion))
+        looped = closed_loop(evidence.train.record, evidence.method(fit.criterion))
+        warnings[:] = [*without_exchanged(warnings, looped), *looped]
         warnings += few_frequencies(evidence.train.record, len(fit.problem.names))
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")

@@ -187,11 +187,11 @@ class MissingResult(Content):
 
 
 class LateInputResult(Content):
-    """An input that acts later than in the equations, with what each way leaves."""
+    """An input that acts later or earlier than in the equations, with what each way leaves."""
 
     input: str
-    delay: int
-    """Samples."""
+    delay: int | float
+    """Samples, such as 2 or 2.4; negative of an input that acts earlier than recorded."""
     delayed: Number
     time_constant: Number
     """Of a first-order lag, in s."""
@@ -327,6 +327,7 @@ class AdviceResult(Content):
 
     `change` has the new values by their keys, `before` and `after` the RMS errors in standard
     deviations of the training output; `before` is None where the model as it is diverges.
+    Both are None of a change that comes first but cannot be tried.
     """
 
     change: dict[str, Any]

@@ -11,8 +11,10 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
+from orthaug._base.lines import plural
 from orthaug.analysis.filtered_rows import filter_rows
 from orthaug.analysis.memory import MemoryTerm
+from orthaug.analysis.predictability import from_lags
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.motion_task import MotionTask
@@ -37,6 +39,12 @@ _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
 _EXPLAINED = 0.7  # of the output's deviation: what is left above it is not explained by a delay
 _ALIKE = 0.25  # of the better one's error: by less a lag and a delay are not distinguished
 _ALIKE_AHEAD = 0.05  # of errors ahead, which are those of all rows alike
+_FINER = 0.1  # lower than by a delay of whole samples: by a part of one more or less
+_PART = 0.1  # of a sample, to which a delay is refined
+_REFINED = 8  # fits for that, at most
+_EARLIEST = 2  # samples by which rows may be logged late
+_SEEN_EARLY = 4  # rows of such an input that may still predict what is left
+_FOLLOWED = 0.02  # of what is left, that they predict: the input acts at once instead
 _LONGEST = 20  # rows of the record to one of delay
 _REFITTED = 30  # iterations from where the declared hold ended
 
@@ -196,12 +204,13 @@ class LateInput:
     """An input that acts later than in the equations: by a delay, or through a first-order lag.
 
     The residuals of the physics with the best of each, and as declared, are in deviations of the
-    outputs. A lag's time constant is in samples.
+    outputs. A lag's time constant is in samples. A negative delay is an input that acts earlier
+    than recorded; no lag is set beside it.
     """
 
     input: str
     sampling_time: float
-    delay: int
+    delay: float
     delayed: float
     lag: int
     lagged: float
@@ -215,18 +224,31 @@ class LateInput:
         return self.lagged < self.delayed
 
     @property
+    def early(self) -> str:
+        """By how much the input acts earlier than recorded, in words; empty if it does not."""
+        if self.delay >= 0:
+            return ""
+        return f"{'a sample' if self.delay == -1 else plural(-self.delay, 'sample')} earlier"
+
+    @property
     def gain(self) -> str:
         """Gain by the better one, beside the other, in words."""
-        late = f"a delay of {self.delay} sample{'s' * (self.delay > 1)}"
+        late = f"a delay of {plural(self.delay, 'sample')}"
         slow = f"a first-order lag of {self.time_constant:.3g} s"
         pairs = [(slow, self.lagged), (late, self.delayed)]
         (better, least), (other, more) = pairs if self.by_lag else pairs[::-1]
         error = "the error of physics alone"
         if self.ahead:
             error = "what the past does not predict of the error of physics alone"
+        if self.early:
+            return (
+                f"with its values {self.early} {error} is {self.delayed:.3g} standard deviations "
+                f"of the output instead of {self.declared:.3g}"
+            )
+        beside = f" ({more:.3g} with {other})" if self.lag else ""
         return (
             f"with {better} {error} is {least:.3g} standard deviations of the output instead of "
-            f"{self.declared:.3g} ({more:.3g} with {other})"
+            f"{self.declared:.3g}{beside}"
         )
 
     @property
@@ -237,12 +259,16 @@ class LateInput:
     @property
     def alike(self) -> bool:
         """True if the data hardly distinguish a lag from a delay."""
+        if self.early:
+            return False
         alike = _ALIKE_AHEAD if self.ahead else _ALIKE
         return abs(self.lagged - self.delayed) < alike * min(self.lagged, self.delayed)
 
     @property
     def manner(self) -> str:
         """How the input acts, in words."""
+        if self.early:
+            return f"{self.early} than recorded"
         by_lag = self.by_lag and not self.alike
         return "through a lag" if by_lag else "later than in the equations"
 
@@ -257,6 +283,13 @@ class LateInput:
             'delay the input by [[data.prepare]] with step = "shift", channel = '
             f'"{self.input}", samples = {self.delay}.'
         )
+        found = f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters."
+        if self.early:
+            remedy = (
+                f"Its rows may be logged late: {late.replace('delay', 'advance', 1)} If it acts on "
+                "an output at once, write that into the equation of the output instead."
+            )
+            return Warning("late_rows", f"{found} {remedy}")
         code = "slow_input" if self.by_lag else "dead_time"
         if self.alike:
             remedy = (
@@ -270,17 +303,18 @@ class LateInput:
                 f"If there is a dead time, {late} If a drive or a sensor is slow, model it in the "
                 "equations."
             )
-        found = f"{self.input} seems to act {self.manner}: {self.gain}, with other parameters."
         return Warning(code, f"{found} {remedy}")
 
 
 def find_late_inputs(task: MotionTask, solver: Solver) -> tuple[LateInput, ...]:
-    """Return the inputs that act clearly later than in the equations, and by how much.
+    """Return the inputs that act clearly later than in the equations, or earlier, and by how much.
 
     Each input is delayed in turn, by 1, 2, 4, … samples while that explains the data better, then
-    by what lies between; where a delay helps, a lag's time constant is sought in the same way.
+    by what lies between, and by a part of a sample where that lowers the error further; where a
+    delay helps, a lag's time constant is sought in the same way.
     Physics alone is refitted each time from where the nearest one ended. A lag of the input acts
-    on linear physics as one of every sensor.
+    on linear physics as one of every sensor. Where no delay helps, the input is advanced by a
+    sample or two: rows that a logger writes late act so.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -303,14 +337,71 @@ def find_late_inputs(task: MotionTask, solver: Solver) -> tuple[LateInput, ...]:
             delayed, lagged = (
                 partial(fits[number, change].leaves, measure) for change in (_delay, _lag)
             )
-            best, before = _lowest_argument(delayed, most), measure(*declared)
+            whole, before = _lowest_argument(delayed, most), measure(*declared)
+            best = _refine(fits[number, _delay], delayed, whole, before)
             if delayed(best) < min((1 - _LATE) * before, _EXPLAINED):
                 slow = _lowest_argument(lagged, most)
                 late = LateInput(
                     name, sampling_time, best, delayed(best), slow, lagged(slow), before
                 )
                 found[name] = replace(late, ahead=measure is not residual_of)
+            elif measure is residual_of and not whole:
+                early = _advance(fits[number, _delay])
+                if early:
+                    left = delayed(-early)
+                    found[name] = LateInput(name, sampling_time, -early, left, 0, before, before)
     return tuple(found[name] for name in names if name in found)
+
+
+def _refine(fits: _LateFits, leaves: Callable[[float], float], whole: int, before: float) -> float:
+    """Return a delay in whole samples, or with a part of one where that surely leaves less.
+
+    A part of a sample resembles missing physics, so that what it leaves must not follow the input,
+    and, below one, another hold.
+    """
+    from scipy.optimize import minimize_scalar
+
+    motion = fits.task.problem.motion
+    if motion.scheme.discrete or (not whole and motion.hold != "zero-order"):
+        return whole
+    near = [whole + 0.5, *([whole - 0.5] if whole else [])]
+    if min(map(leaves, [whole, *near])) >= min((1 - _LATE) * before, _EXPLAINED):
+        return whole
+    around = (max(whole - 1, 0), whole + 1)
+    options = {"xatol": _PART / 2, "maxiter": _REFINED}
+    found = minimize_scalar(leaves, bounds=around, method="bounded", options=options)
+    best = round(round(float(found.x) / _PART) * _PART, 10)
+    if leaves(best) >= (1 - _FINER) * leaves(whole):
+        return whole
+    return best if _followed(fits, best) < _FOLLOWED else whole
+
+
+def _advance(fits: _LateFits) -> int:
+    """Return the samples by which an input surely acts earlier than recorded; 0 of none.
+
+    A plant on which the input acts at once resembles that, but then what an advance leaves still
+    follows the input; and a discrete plant may well have no delay.
+    """
+    if fits.task.problem.motion.scheme.discrete:
+        return 0
+    left, early = partial(fits.leaves, residual_of), 0
+    while early < _EARLIEST and left(-early - 1) < left(-early):
+        early += 1
+    clearly = left(-early) < min((1 - _LATE) * left(0), _EXPLAINED)
+    return early if early and clearly and _followed(fits, -early) < _FOLLOWED else 0
+
+
+def _followed(fits: _LateFits, samples: float) -> float:
+    """Return the share of an output's error that an input so changed still predicts."""
+    segmented, free_fit = fits.tried[samples]
+    if free_fit is None:
+        return 1.0
+    errors = _errors(segmented, free_fit)
+    inputs = _by_segment(segmented, np.asarray(segmented.segments.inputs))
+    one = [piece[:, fits.number] for piece in inputs]
+    lags = range(_SEEN_EARLY)
+    outputs = range(errors[0].shape[1])
+    return max(from_lags([e[:, j] for e in errors], [one], lags).sure for j in outputs)
 
 
 def _unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
@@ -333,8 +424,13 @@ def _unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> flo
 def _errors(segmented: SegmentedMotion, free_fit: FreeRunFit) -> list[Matrix]:
     """Return a free run's errors (T, ny) in every segment, in deviations of the outputs."""
     errors = np.asarray(free_fit.end.point.errors) / segmented.deviation[:, None]
-    scored = np.moveaxis(np.asarray(segmented.segments.scored), 1, -1).reshape(-1, errors.shape[1])
-    pieces = np.moveaxis(errors, 3, 1).reshape(-1, *errors.shape[1:3])
+    return _by_segment(segmented, errors)
+
+
+def _by_segment(segmented: SegmentedMotion, values: np.ndarray) -> list[Matrix]:
+    """Return values (k, T, n, m) at the scored steps of every segment, each (T, n)."""
+    scored = np.moveaxis(np.asarray(segmented.segments.scored), 1, -1).reshape(-1, values.shape[1])
+    pieces = np.moveaxis(values, 3, 1).reshape(-1, *values.shape[1:3])
     return [piece[kept] for piece, kept in zip(pieces, scored, strict=True) if kept.any()]
 
 
@@ -345,12 +441,12 @@ class _LateFits:
     task: MotionTask
     solver: Any
     number: int
-    change: Callable[[Vector, int], Vector]
+    change: Callable[[Vector, float], Vector]
     """Of an input's values, by so many samples."""
-    tried: dict[int, tuple[SegmentedMotion, FreeRunFit | None]]
+    tried: dict[float, tuple[SegmentedMotion, FreeRunFit | None]]
     """Where each size ended; none is there from the start."""
 
-    def leaves(self, measure: Measure, samples: int) -> float:
+    def leaves(self, measure: Measure, samples: float) -> float:
         """Return what the physics leaves with the input changed by so many samples."""
         if samples not in self.tried:
             ended = [known for known, (_, free_fit) in self.tried.items() if free_fit is not None]
@@ -361,7 +457,7 @@ class _LateFits:
             self.tried[samples] = refit_physics(self.task, begin, problem.motion, late, self.solver)
         return measure(*self.tried[samples])
 
-    def _late(self, record: Record, samples: int) -> Record:
+    def _late(self, record: Record, samples: float) -> Record:
         """Return the record with the input changed in every experiment."""
 
         def late(inputs: np.ndarray) -> np.ndarray:
@@ -373,7 +469,7 @@ class _LateFits:
         )
 
 
-def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
+def _lowest_argument(leaves: Callable[[float], float], most: int) -> int:
     """Return the argument from 0 on at which a function that falls and then rises is least."""
     best, step = 0, 1
     while step <= most and leaves(step) < leaves(best):
@@ -385,12 +481,12 @@ def _lowest_argument(leaves: Callable[[int], float], most: int) -> int:
     return best
 
 
-def _delay(values: Vector, samples: int) -> Vector:
-    """Return an input later by so many samples; before the record it has its first value."""
-    first = np.full(min(samples, len(values)), values[0])
-    return np.concatenate([first, values])[: len(values)]
+def _delay(values: Vector, samples: float) -> Vector:
+    """Return an input later by so many samples; beyond the record it has the value at its end."""
+    rows = np.arange(len(values))
+    return np.interp(rows - samples, rows, values)
 
 
-def _lag(values: Vector, samples: int) -> Vector:
+def _lag(values: Vector, samples: float) -> Vector:
     """Return an input behind a first-order lag whose time constant is so many samples."""
     return MemoryTerm("lag", "input", float(samples)).along(values, 1.0)

@@ -466,7 +466,7 @@ def free_run_words(
             f"{late[0].input} acts {late[0].manner}: {late[0].gain}."
         )
     if lacks is not None:
-        named = _name_terms(lacks)
+        named = _name_terms(lacks, fit)
         held = fit.problem.motion.held
         if held and not lacks.scattered and lacks.terms[0].shape == SHAPES[0]:
             named += (
@@ -520,7 +520,7 @@ def describe_colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, 
     return "; ".join(clauses)
 
 
-def _name_terms(lacks: MissingTest) -> str:
+def _name_terms(lacks: MissingTest, fit: MotionEstimate) -> str:
     """Return the terms that are most likely missing, or the equations where many explain a part."""
     best, *others = lacks.terms
     if lacks.scattered:
@@ -539,6 +539,12 @@ def _name_terms(lacks: MissingTest) -> str:
     if others:
         text += (
             f", as would {' or '.join(f'{term.expression} {_that(term)}' for term in others[:2])}"
+        )
+    at_once = best.output is not None and best.shape == "linear"
+    if at_once and best.variable in fit.problem.motion.external:
+        text += (
+            f". If {best.variable} cannot act at once, its rows may be logged late: then advance "
+            f'it by step = "shift" of data.prepare, by a sample or a part of one'
         )
     return f"{text}."
 

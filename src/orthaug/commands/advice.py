@@ -14,17 +14,20 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
 from orthaug.analysis.changes import Change
+from orthaug.analysis.closed_loop import exchanged_with_output
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult, LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, declared_output
 from orthaug.commands.spec import spec_model
-from orthaug.data.preparation import prepare
+from orthaug.data.preparation import STEPS, prepare
 from orthaug.data.record import Record
 from orthaug.data.steps import Shift
+from orthaug.data.wild import mendings
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
 from orthaug.fitting.kinds import CRITERIA
 from orthaug.reports.result import FitResult
@@ -52,6 +55,10 @@ class Proposal:
     """A parameter that has to be positive, such as the size of a dead zone."""
     step: Any = None
     """Step of preparation that the change adds: the rows of the trial have the others already."""
+    mends: bool = False
+    """True if the step leaves out samples: on the others the present model is judged, too."""
+    untried: str = ""
+    """Why a free run would not show its effect, as a sentence; empty of what is tried."""
     ahead: tuple[float, float] | None = None
     """What errors' past does not predict of them, without the change and with it, where that shows
     it: beside slow disturbances its gain in a free run is hidden."""
@@ -61,6 +68,58 @@ class Proposal:
         if self.positive is None:
             return True
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
+
+
+def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
+    """Return the steps of preparation that warnings on the record name as their remedies.
+
+    What the record shows wrongly looks like missing physics, so these come before all others.
+    """
+    record, found = job.train.record, []
+    known = {(warning.code, warning.text) for warning in result.warnings}
+    motion = job.physics.section == "motion"
+    if any(warning.code == "exchanged_columns" for warning in result.warnings):
+        found += _exchange(job)
+    for mending in mendings(record) if job.train.source is None else ():
+        name, output = mending.step["step"], mending.output
+        if tuple(mending.warning) not in known or (name == "repeats" and not motion):
+            continue
+        steps = [*job.declaration["data"].get("prepare", []), mending.step]
+        change: dict[str, Any] = {"data.prepare": steps}
+        step = STEPS.declare(name, {k: v for k, v in mending.step.items() if k != "step"})
+        if name == "unwrap":
+            words = f'{output} unwrapped (step = "unwrap" of data.prepare)'
+            found.append(Proposal(words, change, step=step, untried=_OTHER_OUTPUT))
+            continue
+        change |= {"data.missing": "keep"} if motion else {}
+        ends = [f"{mending.step[key]:.6g}" for key in ("low", "high") if key in mending.step]
+        which = "repeats" if name == "repeats" else f"samples at {join_words(ends)}"
+        words = f'{which} of {output} marked as missing (step = "{name}" of data.prepare)'
+        found.append(Proposal(words, change, step=step, mends=True))
+    return found
+
+
+def _exchange(job: Job) -> Iterator[Proposal]:
+    """Yield the columns of the only output and of an input that seems to be its cause exchanged."""
+    record = job.train.record
+    name, output = exchanged_with_output(record), record.outputs[0]
+    given = next((channel for channel in record.inputs if channel.name == name), None)
+    if given is not None:
+        change = {
+            f"data.channels.{name}.column": output.file_column,
+            f"data.channels.{output.name}.column": given.file_column,
+        }
+        words = f"the columns of {name} and {output.name} exchanged"
+        yield Proposal(words, change, untried=_OTHER_OUTPUT)
+
+
+def _noise_model(fit: Estimate, result: FitResult) -> list[Proposal]:
+    """Return a noise model where θ is inconsistent and training on the free run is no better."""
+    compared = fit.focus is not None and fit.focus.tried("simulation")
+    if not compared or all(warning.code != "inconsistent" for warning in result.warnings):
+        return []
+    words = 'a noise model (`noise.model` = "auto")'
+    return [Proposal(words, {"noise.model": "auto"}, untried=_OTHER_NOISE)]
 
 
 def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
@@ -105,7 +164,7 @@ def _is_biased(result: FitResult) -> bool:
 
 
 def _late_inputs(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield a lag or a delay of each input that acts late: the better, and both where alike."""
+    """Yield a lag or a shift of each input that acts late: the better, and both where alike."""
     for late in result.residuals.late if result.residuals is not None else ():
         kinds = (_lag, _delay) if late.by_lag else (_delay, _lag)
         for kind in kinds if late.alike else kinds[:1]:
@@ -125,9 +184,13 @@ def _lag(job: Job, late: LateInputResult) -> Iterator[Proposal]:
 def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
     """Yield a shift of an input in the preparation of the data."""
     step = Shift(late.input, late.delay)
-    declared = {"step": "shift", "channel": late.input, "samples": late.delay}
-    steps = [*job.declaration["data"].get("prepare", []), declared]
-    words = f'{late.input} {plural(late.delay, "sample")} later (step = "shift" of data.prepare)'
+    steps = [dict(one) for one in job.declaration["data"].get("prepare", [])]
+    if steps and steps[-1]["step"] == "shift" and steps[-1]["channel"] == late.input:
+        steps[-1]["samples"] = round(steps[-1]["samples"] + late.delay, 10)
+    else:
+        steps.append({"step": "shift", "channel": late.input, "samples": late.delay})
+    moved = f"{plural(abs(late.delay), 'sample')} {'later' if late.delay > 0 else 'earlier'}"
+    words = f'{late.input} {moved} (step = "shift" of data.prepare)'
     yield Proposal(words, {"data.prepare": steps}, step=step)
 
 
@@ -313,11 +376,17 @@ _PIECES = 3  # of the training rows, the last of which is held out where there i
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
+_ALIKE = 0.95  # of an error: a step of preparation, which adds no parameter, is named first above
 _CHANCE = (
     " It may be chance: the errors remember each other over much of the record, so that few are "
     "independent."
 )
+_NONE_TRIED = AdviceTrialsResult(text="No change of the spec was tried.", tried=0, not_tried=0)
 _LISTED = 3  # changes without gain that the text names
+_OTHER_NOISE = (
+    "It was not tried, because it moves the parameters and their intervals more than the free run."
+)
+_OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,6 +437,8 @@ class ProposalErrors:
     proposal: Proposal
     pieces: Pieces | None
     physics_only: bool = False
+    base: Pieces | None = None
+    """The present model's errors on the same samples, where the proposal leaves some out."""
 
     @property
     def error(self) -> float:
@@ -405,6 +476,8 @@ class Trials:
         variant: Variant,
         accepts: Callable[[Any], bool] = lambda fit: True,
         step: Any = None,
+        *,
+        mends: bool = False,
     ) -> Pieces | None:
         """Return the squared errors of the free run of a job's model.
 
@@ -412,10 +485,12 @@ class Trials:
 
         Args:
             step: of preparation, which its rows still lack.
+            mends: judge the model with the step, but train it without.
         """
         try:
             rows = self.rows if step is None else self.rows.prepared(step, job.spec.data.missing)
-            fit = job.fold_fit(variant, briefly=True)(rows.training)
+            training = self.rows.training if mends else rows.training
+            fit = job.fold_fit(variant, briefly=True)(training)
             if not fit.status.ok or not accepts(fit):
                 return None
             return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips)
@@ -433,7 +508,10 @@ class Trials:
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
         kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
         pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
-        return ProposalErrors(proposal, pieces, physics_only)
+        if not proposal.mends:
+            return ProposalErrors(proposal, pieces, physics_only)
+        base = self.run(job, self.variant, step=proposal.step, mends=True)
+        return ProposalErrors(proposal, pieces, physics_only, base)
 
 
 def apply_change(declaration: dict[str, object], change: dict[str, Any]) -> dict[str, Any]:
@@ -459,8 +537,21 @@ def advise(
     """
     if job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
-    found = proposals(job, result, fit)
-    if not found:
+    mending, found = mending_proposals(job, result), proposals(job, result, fit)
+    untried = [proposal for proposal in mending if proposal.untried]
+    first = untried or _noise_model(fit, result)
+    others = None if untried else _tried(job, fit, result, mending, found)
+    if not first:
+        return others
+    advice, trials = others or ([], _NONE_TRIED)
+    return [*map(_untried, first), *advice], trials
+
+
+def _tried(
+    job: Job, fit: Any, result: FitResult, mending: list[Proposal], found: list[Proposal]
+) -> tuple[list[AdviceResult], AdviceTrialsResult] | None:
+    """Return the changes that lower the error in a trial, and a count; as `advise`."""
+    if not mending and not found:
         return None
     try:
         rows = ValidationRows.of(job)
@@ -482,13 +573,21 @@ def advise(
             f"over {rows.where}, where the error of this one is {_error(here)}. The rows before do "
             "not determine it, so a comparison there would say little."
         )
-        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
-    chosen = found[: job.physics.most_trials]
-    tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
+        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(mending) + len(found))
+    mended = [trials.of(proposal, physics_only=False) for proposal in mending]
+    mends = any(_helps(one, base) for one in mended)  # what seems missing comes from these samples
+    chosen = [] if mends else found[: job.physics.most_trials]
+    tried = mended + [trials.of(proposal, physics_only=False) for proposal in chosen]
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings
     )
-    return _conclude_trials(base, tried, rows, len(found) - len(tried), learns, slow=slow)
+    return _conclude_trials(base, tried, rows, len(found) - len(chosen), learns, slow=slow)
+
+
+def _untried(one: Proposal) -> AdviceResult:
+    """Return a change that comes before all others but cannot be tried."""
+    text = f"Fit with {one.words}. {one.untried}"
+    return AdviceResult(change=one.change, text=text, before=None, after=None)
 
 
 def _conclude_trials(
@@ -506,24 +605,17 @@ def _conclude_trials(
         slow: whether errors remember each other for so long that few of them are independent.
     """
     before = math.sqrt(mean_square(base))
-    poor = before < _RUNS_AWAY  # then what stays no better than the mean is no remedy
-    helps = [
-        one
-        for one in tried
-        if one.pieces is not None
-        and (one.proposal.ahead is not None or _ratio(one.pieces, base).code == "helps")
-        and not (one.error > _NO_BETTER and (poor or one.error > _TAMED * before))
-    ]
+    helps = [one for one in tried if _helps(one, base)]
     better: list[ProposalErrors] = []
-    for one in sorted(helps, key=lambda one: one.error):
+    for one in sorted(helps, key=_rank):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
     advice = [
         AdviceResult(
             change=one.proposal.change,
-            text=_advice_text(one, before, rows)
+            text=_advice_text(one, _before(one, base), rows)
             + (_CHANCE if slow and one is better[0] and _may_be_chance(one, before) else ""),
-            before=before,
+            before=_before(one, base),
             after=one.error,
         )
         for one in better
@@ -539,7 +631,8 @@ def _conclude_trials(
     )
     if worse:
         named = "; ".join(
-            f"{one.proposal.words} ({_error_text(one, before)})" for one in worse[:_LISTED]
+            f"{one.proposal.words} ({_error_text(one, _before(one, base))})"
+            for one in worse[:_LISTED]
         )
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No sure gain over {_error(before)}: {named}{more}."
@@ -560,16 +653,44 @@ def _relative_clause(better: int, tried: int) -> str:
     )
 
 
-def _ratio(pieces: Pieces, base: Pieces) -> Ratio:
+def _before(one: ProposalErrors, base: Pieces) -> float:
+    """Return the present model's error on the samples on which a change is judged."""
+    return math.sqrt(mean_square(base if one.base is None else one.base))
+
+
+def _helps(one: ProposalErrors, base: Pieces) -> bool:
+    """Return whether a change surely lowers the error, to one that says something."""
+    if one.pieces is None:
+        return False
+    before = _before(one, base)
+    poor = before < _RUNS_AWAY  # then what stays no better than the mean is no remedy
+    if one.error > _NO_BETTER and (poor or one.error > _TAMED * before):
+        return False
+    own = base if one.base is None else one.base
+    return one.proposal.ahead is not None or _ratio(one, own).code == "helps"
+
+
+def _rank(one: ProposalErrors) -> float:
+    """Return the error by which changes that help are in order."""
+    return one.error * (1.0 if one.proposal.step is None else _ALIKE)
+
+
+def _ratio(one: ProposalErrors, base: Pieces) -> Ratio:
     """Return the ratio of errors to those of the present model, on the rows that both predict.
 
-    With more lags the predictions begin later.
+    With more lags the predictions begin later; with an input's values earlier they end earlier.
     """
-    cut = [
-        (a, b) if a is None or b is None else (a[-min(len(a), len(b)) :], b[-min(len(a), len(b)) :])
-        for a, b in zip(pieces, base, strict=True)
+    assert one.pieces is not None
+    early = getattr(one.proposal.step, "samples", 0) < 0
+
+    def cut(piece: Vector, rows: int) -> Vector:
+        return piece[:rows] if early else piece[-rows:]
+
+    both = [
+        (a, b) if a is None or b is None else (cut(a, rows := min(len(a), len(b))), cut(b, rows))
+        for a, b in zip(one.pieces, base, strict=True)
     ]
-    return Ratio.of([a for a, _ in cut], [b for _, b in cut])
+    return Ratio.of([a for a, _ in both], [b for _, b in both])
 
 
 def _may_be_chance(one: ProposalErrors, before: float) -> bool:

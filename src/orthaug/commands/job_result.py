@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from orthaug.analysis.closed_loop import closed_loop
+from orthaug.analysis.closed_loop import closed_loop, without_exchanged
 from orthaug.analysis.informative_data import few_frequencies
 from orthaug.commands.job import Job
 from orthaug.reports.result import CheckResult, FitResult
@@ -31,8 +31,7 @@ def check(job: Job) -> CheckResult:
             "rows": job.problem.count,
             **found,
             "warnings": [
-                *job.warnings,
-                *warnings,
+                *without_exchanged([*job.warnings, *warnings], looped),
                 *looped,
                 *few_frequencies(job.train.record, len(job.problem.names)),
             ],

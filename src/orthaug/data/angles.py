@@ -9,6 +9,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import plural
+from orthaug.data.gaps import Mending
 from orthaug.data.record import Record
 
 _PERIODS = (2 * np.pi, 360.0, *(2.0**n for n in range(8, 25)))  # rad, degrees, an encoder's counts
@@ -60,7 +61,7 @@ def find_wrap(samples: Vector) -> Wrap | None:
     return None
 
 
-def wrap_warnings(record: Record) -> list[Warning]:
+def wrapped_angles(record: Record) -> list[Mending]:
     """Return a warning of each output that is an angle and wraps."""
     found = []
     for j, output in enumerate(record.outputs):
@@ -77,7 +78,8 @@ def wrap_warnings(record: Record) -> list[Warning]:
             f'`[[data.prepare]]` with `step = "unwrap"`, `period = {period}` and '
             f'`channels = ["{output.name}"]`.'
         )
-        found.append(Warning("wrapped_angle", text))
+        step = {"step": "unwrap", "period": float(period), "channels": [output.name]}
+        found.append(Mending(Warning("wrapped_angle", text), output.name, step))
     return found
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -19,6 +20,15 @@ _SHORTEST = 20  # rows of a stretch
 _SATURATED = 0.01  # of the rows, at an extreme value
 _AT_LIMIT = 1e-3  # of the output's deviation: a model so close to an extreme value is there
 _SAME_ROWS = 0.5  # of the rows where data or model are at a limit: both are
+
+
+@dataclass(frozen=True)
+class Mending:
+    """A warning whose remedy is a step of preparation, with that as a spec declares it."""
+
+    warning: Warning
+    output: str
+    step: dict[str, Any]
 
 
 def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
@@ -51,7 +61,7 @@ def held_rows(samples: Vector) -> slice | None:
     return slice(first, None, every)
 
 
-def held_warnings(record: Record) -> list[Warning]:
+def held_outputs(record: Record) -> list[Mending]:
     """Return a warning of each output that is sampled more slowly than the rows, and held."""
     found = []
     for j, output in enumerate(record.outputs):
@@ -70,13 +80,14 @@ def held_warnings(record: Record) -> list[Warning]:
             f'= ["{output.name}"]) and give `missing` = "keep". For lagged physics read these '
             f"rows only: `every` = {n}, `rows` from {first} on."
         )
-        found.append(Warning("held_output", text))
+        step = {"step": "repeats", "channels": [output.name]}
+        found.append(Mending(Warning("held_output", text), output.name, step))
     return found
 
 
-def saturation_warnings(
+def saturated_outputs(
     record: Record, model: Matrix | None = None, limited: Sequence[str] = ()
-) -> list[Warning]:
+) -> list[Mending]:
     """Return a warning of each output that stays at its largest or smallest value for many rows.
 
     Args:
@@ -99,9 +110,12 @@ def saturation_warnings(
         named = " and ".join(
             f"{value:.6g}{unit} on {percent(rows / len(values))}" for value, rows in ends
         )
-        keys = ", ".join(
-            f"`{'high' if value == values.max() else 'low'}` = {value:.6g}" for value, _ in ends
-        )
+        step = {
+            "high" if value == values.max() else "low": float(f"{value:.6g}") for value, _ in ends
+        }
+        keys = ", ".join(f"`{key}` = {value:.6g}" for key, value in step.items())
+        if len(record.outputs) > 1:
+            keys += f', `channels` = ["{output.name}"]'
         text = (
             f"{output.name} is {named} of the rows, its largest or smallest value: the range of "
             "the sensor may end there. A model that follows these rows has wrong parameters. Mark "
@@ -109,7 +123,8 @@ def saturation_warnings(
             '"keep" beside a [motion] and "skip" otherwise. If the plant itself ends there, '
             "write that into the physics."
         )
-        found.append(Warning("saturated_output", text))
+        step = {"step": "limits", **step, "channels": [output.name]}
+        found.append(Mending(Warning("saturated_output", text), output.name, step))
     return found
 
 

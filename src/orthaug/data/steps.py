@@ -5,6 +5,7 @@ They are trends, sampling, outliers, gaps and delays.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Protocol, runtime_checkable
 
@@ -399,11 +400,12 @@ class Unwrap:
 class Shift:
     """Step that delays an input by `samples`: row k gets the value of row k − samples.
 
-    The rows without one are cut off.
+    Between two rows that is on the straight line from one to the other. The rows without one are
+    cut off.
 
     Args:
         channel: an input's name.
-        samples: a whole number; negative to let the input come earlier.
+        samples: a number of rows, such as 2 or 2.4; negative to let the input come earlier.
 
     Examples:
         >>> from orthaug.data import Record, prepare
@@ -414,12 +416,14 @@ class Shift:
     """
 
     channel: str
-    samples: int
+    samples: float
 
     def __post_init__(self) -> None:
         check_type(self.channel, str, "channel", "an input's name")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int):
-            raise InputError(f"`samples` must be a whole number; got {show(self.samples)}.")
+        if not is_number(self.samples):
+            raise InputError(f"`samples` must be a finite number; got {show(self.samples)}.")
+        if self.samples == int(self.samples):
+            object.__setattr__(self, "samples", int(self.samples))
 
     def apply(self, run: Run) -> Run:
         if self.channel not in run.names[: run.inputs]:
@@ -433,8 +437,12 @@ class Shift:
             raise InputError(
                 f"`samples`: an experiment has {n} rows, too few to be shifted by {late}."
             )
-        kept = slice(max(late, 0), n + min(late, 0))
-        values = run.values[kept].copy()
-        values[:, j] = run.values[kept.start - late : kept.stop - late, j]
+        whole = math.floor(late)
+        kept = slice(max(math.ceil(late), 0), n + min(whole, 0))
+        values, column = run.values[kept].copy(), run.values[:, j]
+        values[:, j] = column[kept.start - whole : kept.stop - whole]
+        if part := late - whole:
+            before = column[kept.start - whole - 1 : kept.stop - whole - 1]
+            values[:, j] = (1 - part) * values[:, j] + part * before
         first = run.first + run.stride * kept.start
         return replace(run, values=values, instants=run.instants[kept], first=first)

@@ -16,8 +16,14 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
-from orthaug.data.angles import reset_warnings, wrap_warnings
-from orthaug.data.gaps import complete_record, filled_record, held_warnings, saturation_warnings
+from orthaug.data.angles import reset_warnings, wrapped_angles
+from orthaug.data.gaps import (
+    Mending,
+    complete_record,
+    filled_record,
+    held_outputs,
+    saturated_outputs,
+)
 from orthaug.data.record import Record
 from orthaug.data.steps import Outliers
 
@@ -207,10 +213,21 @@ def data_warnings(
         )
     if complete is None:
         return found
-    found += _repeat_warnings(complete) or held_warnings(complete)
-    found += wrap_warnings(complete) + _same_signal_warnings(complete)
-    limits = saturation_warnings(complete, limited=limited)
-    return [*found, *_frozen_warnings(complete), *limits]
+    held, wrapped, limits = _mendings_of(complete, limited)
+    found += _repeat_warnings(complete) or [one.warning for one in held]
+    found += [one.warning for one in wrapped] + _same_signal_warnings(complete)
+    return [*found, *_frozen_warnings(complete), *(one.warning for one in limits)]
+
+
+def mendings(record: Record) -> list[Mending]:
+    """Return the warnings on a record whose remedy is a step of preparation."""
+    complete = complete_record(record)
+    return [] if complete is None else [one for kind in _mendings_of(complete) for one in kind]
+
+
+def _mendings_of(record: Record, limited: Sequence[str] = ()) -> tuple[list[Mending], ...]:
+    limits = saturated_outputs(record, limited=limited)
+    return held_outputs(record), wrapped_angles(record), limits
 
 
 def _same_signal_warnings(record: Record) -> list[Warning]:

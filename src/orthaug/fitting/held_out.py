@@ -143,6 +143,10 @@ class Focus:
     text: str
     candidates: tuple[Candidate, ...] = ()
 
+    def tried(self, focus: str) -> bool:
+        """Return whether training by a criterion was compared with others."""
+        return any(c.focus == focus and not math.isnan(c.error) for c in self.candidates)
+
 
 @dataclass(frozen=True, eq=False)
 class HeldOutErrors:

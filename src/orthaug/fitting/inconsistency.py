@@ -60,6 +60,8 @@ class Inconsistency:
     apart: Vector
     instruments: Vector | None = None
     instruments_std: Vector | None = None
+    compared: bool = False
+    """True if training on the free run was tried, and was not better."""
 
     @property
     def found(self) -> bool:
@@ -95,11 +97,14 @@ class Inconsistency:
             text += (
                 f" Instrumental variables (the outputs of the free run) give {', '.join(given)}."
             )
-        text += (
-            " The intervals of the one-step θ do not include this bias. Train on the free run "
-            '(focus = "simulation"), which does not have it, or with a noise model ([noise] '
-            'model = "auto").'
+        remedy = (
+            'Train with a noise model ([noise] model = "auto"): training on the free run was '
+            "tried, and is not better."
+            if self.compared
+            else 'Train on the free run (focus = "simulation"), which does not have it, or with a '
+            'noise model ([noise] model = "auto").'
         )
+        text += f" The intervals of the one-step θ do not include this bias. {remedy}"
         return Warning("inconsistent", text)
 
 
@@ -185,6 +190,7 @@ def inconsistency(
         fit.theta + step,
         _plain_std(rows),
         apart,
+        compared=fit.focus is not None and fit.focus.tried("simulation"),
     )
     if not found.found:
         return found

@@ -349,6 +349,7 @@ _UNTESTED = {
     "reset_output": "an output goes on elsewhere within its record",
     "wrapped_angle": "an angle wraps in its record",
     "held_output": "a sensor is slower than the rows of its data",
+    "exchanged_columns": "an input and an output may be exchanged",
     "saturated_output": "an output is recorded at an end of its range",
     "wild_rows": "a few rows, which may be wrong, decide its parameters",
     "short_for_noise": "its record is too short to distinguish noise from disturbances that last",
