@@ -54,11 +54,8 @@ class PublicSet:
 
     @property
     def unit(self) -> str | None:
-        """Unit of the errors, by default that of the only output; None for those of several."""
-        data = self.content["data"]
-        outputs, channels = data["outputs"], data.get("channels", {})
-        only = channels.get(outputs[0], {}).get("unit") if len(outputs) == 1 else None
-        return self.content.get("unit", only)
+        """Unit of the errors; None for those of the outputs."""
+        return self.content.get("unit")
 
     def spec(
         self, model: str, *, default: bool = False, folder: Path | None = None
