@@ -249,6 +249,10 @@ def test_the_list_has_every_set_with_its_protocol_and_published_figures(monkeypa
     assert "0.301 mV" in done.out
     assert "The first 50 samples" in done.out
     assert "10.4121/12960104" in done.out
+    refused = run("benchmark", "--list", "--json")
+    assert refused.code == 2
+    assert one_line(refused.err, "--json: found beside --list")
+    assert finite_json(refused.out)["error"]["code"] == "input_invalid"
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -578,6 +578,7 @@ def test_what_is_written_beside_the_code(tmp_path):
         text = (tmp_path / target / "README.md").read_text()
         assert f'"checksum": "{program.digest}"' in (tmp_path / "model" / "model.json").read_text()
         assert program.digest in text and "`u` [N]" in text and "0.1 s" in text
+        assert ("`-ffast-math`, which takes NaN for impossible." in text) == (target == "c")
         assert any(
             program.digest in path.read_text() for path in (tmp_path / target).glob("plant.*")
         )

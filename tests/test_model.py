@@ -409,9 +409,9 @@ def test_horizon_refused(first_order, horizon):
         (
             "predict",
             {"u": np.ones(1), "y": np.ones(1), "source": "a.csv"},
-            "a.csv has 1 rows, too few: the first value is at row 1",
+            "a.csv has 1 row, too few: the first value is at row 1",
         ),
-        ("simulate", {"u": np.ones(1), "y": np.ones(1)}, "the record has 1 rows, too few"),
+        ("simulate", {"u": np.ones(1), "y": np.ones(1)}, "the record has 1 row, too few"),
     ],
 )
 def test_records_refused(first_order, verb, arguments, message):

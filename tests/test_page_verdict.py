@@ -17,7 +17,7 @@ from orthaug.analysis.findings import (
 )
 from orthaug.analysis.fit_findings import ParameterResult, PartScores, ScoreResult, StatusResult
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
-from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
+from orthaug.reports.result import CompareResult, DataResult, DifferenceResult, FitResult, RowResult
 from orthaug.reports.text import compare_text
 
 DATA = DataResult(train=[], tests={"far": []})
@@ -165,6 +165,12 @@ def test_a_comparison_has_the_doubts_of_its_model():
     found = compare_verdict(compared(row("physics alone", 0.5, code=None), doubted))
     assert found.level == "care"
     assert "But training stopped before it converged and its stability is not proved" in found.trust
+
+
+def test_saved_results_with_the_same_parameters_differ_by_nothing():
+    one = DifferenceResult(name="theta1", result="second", value=0.0, of_std=0.0)
+    both = compared(row("first", 0.1), row("second", 0.1)).model_copy(update={"differences": [one]})
+    assert compare_verdict(both).use == "The parameters are the same."
 
 
 def test_of_models_that_are_as_good_the_one_whose_parameters_mean_something_is_taken():

@@ -108,7 +108,7 @@ REFUSED = [
     (RECORD, physics("u[k]"), {"learner_inputs": ("y[k]",)}, "learner input: .*is the output that is to be predicted"),
     (RECORD, physics("u[k]"), {"learner_inputs": ("import os",)}, "learner input: 'import os' is not an expression"),
     (RECORD.rows(0, 3), physics("u[k-5]"), {}, "run.csv has 3 rows, too few: the largest lag is 5, so at least 6"),
-    (RECORD.rows(0, 2), physics("u[k]", "1", "y[k-1]"), {}, "1 usable rows for 3 parameters"),
+    (RECORD.rows(0, 2), physics("u[k]", "1", "y[k-1]"), {}, "1 usable row for 3 parameters"),
     (RECORD, FUNCTION, {}, "a baseline function needs `lags`"),
     (
         RECORD,

@@ -25,6 +25,7 @@ from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.commands.compare import compare_report
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
+from orthaug.models.response import Scores
 from orthaug.reports.learned_part import Curve, curve_limits
 from orthaug.reports.page import fit_page
 from orthaug.reports.page_blocks import interval, number, percent
@@ -40,6 +41,7 @@ from orthaug.reports.page_runs import (
     worst_window,
 )
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
+from orthaug.reports.text import scores_text
 
 SUSPECT = '[[suspects]]\nname = "square"\non = "u[k-1]**2"\n'
 FIT = ["Verdict", "Parameters", "Free run", "Physics and learner", "What was learned", "Scores", "Residual tests",
@@ -126,6 +128,12 @@ def values(series: dict) -> np.ndarray:
 
 
 KINDS = ("lagged", "motion", "compared")
+
+
+def test_one_row_that_is_scored_is_no_rows():
+    one = Scores(np.array([0.1]), np.array([np.nan]), np.array([np.nan]), 1)
+    head = scores_text(one, [Channel("y")], None).splitlines()[0]
+    assert head.startswith("free run, 1 row ")
 
 
 @pytest.mark.parametrize("kind", KINDS)

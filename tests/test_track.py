@@ -87,6 +87,22 @@ def test_a_changed_system_raises_the_alarm(project, tmp_path):
     assert 200 <= alarm["row"] < 230
 
 
+def test_rows_with_missing_samples_count(project, tmp_path):
+    folder, _ = project
+    u, y = signals(300, 8)
+    y = y + np.where(np.arange(300) < 200, 0.0, 3 * y.std() * np.sin(np.arange(300)))
+    missing = (np.arange(300) < 4) | ((np.arange(300) >= 50) & (np.arange(300) < 130))
+    write_csv(tmp_path / "holes.csv", u=u, y=np.where(missing, np.nan, y))
+    data = ("--data", tmp_path / "holes.csv", "--training", folder / "run.csv")
+    done = run("track", folder / "fit", *data, "--out", tmp_path / "out")
+    assert done.code == 0, done.err
+    result = finite_json((tmp_path / "out" / "result.json").read_text())
+    assert result["rows"] == 300
+    assert 200 <= result["alarms"][0]["row"] < 230
+    rows = pd.read_csv(tmp_path / "out" / "table.csv")["row"]
+    assert not set(rows) & set(np.flatnonzero(missing)) and {49, 299} <= set(rows)
+
+
 REFUSED = [
     ((), ("--training: is missing",)),
     (("--training", "run.csv", "--state", "first"), ("--training: found beside --state",)),

@@ -611,6 +611,12 @@ def benchmark(
     sets = choose_sets(names or [])
     packages = choose_packages(beside or [])
     if listed:
+        if as_json:
+            from orthaug._base.errors import InputError
+
+            raise InputError(
+                "--json: found beside --list, which prints text; leave one of them out."
+            )
         streams.echo(list_text([one.result() for one in sets]))
         return
     from orthaug.commands import benchmark as records

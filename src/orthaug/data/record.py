@@ -495,6 +495,19 @@ class Record(NotebookView):
         return tuple(found)
 
     @property
+    def lost_rows(self) -> list[int]:
+        """Rows with missing samples that were left out of the recording before each experiment."""
+        found: list[int] = []
+        recordings = self.recordings
+        for i, one in enumerate(self.experiments):
+            before = self.experiments[i - 1]
+            lost = one.offset
+            if i and recordings[i] == recordings[i - 1]:
+                lost = (one.first_row - before.first_row) // one.stride - len(before)
+            found.append(max(lost, 0))
+        return found
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """Outputs first, then inputs: the order of the regressor."""
         return self.outputs + self.inputs

@@ -13,6 +13,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, show
+from orthaug._base.lines import plural
 from orthaug.data.expressions import LARGEST_LAG, Expression, Lag
 from orthaug.data.record import Experiment, Record
 
@@ -151,8 +152,8 @@ def stack_rows(record: Record, layout: Layout) -> UsableRows:
         if len(experiment) <= start:
             name = experiment.source or f"experiment {i}"
             raise InputError(
-                f"{name} has {len(experiment)} rows, too few: the largest lag is {start}, "
-                f"so at least {start + 1} are needed."
+                f"{name} has {plural(len(experiment), 'row')}, too few: the largest lag is "
+                f"{start}, so at least {start + 1} are needed."
             )
     x = lag_rows(record, layout)
     y = [experiment.outputs[start:] for experiment in record.experiments]

@@ -44,9 +44,7 @@ says the largest difference from the test vectors. With `-D{name.upper()}_FLOAT`
 `{name}_run` takes many samples at once. Where an input or a result is NaN or infinite,
 `state.flag` is 1 after the step and the state is left as it was; otherwise it is 0. There is no
 allocation, no input or output, and no global that changes, so that several instances need only a
-state each. Do not compile with `-ffast-math`, which
-DELETE
-takes NaN for impossible."""
+state each. Do not compile with `-ffast-math`, which takes NaN for impossible."""
 
 
 def fields_of(program: Program) -> list[tuple[str, Signal, int]]:

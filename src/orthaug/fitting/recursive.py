@@ -186,6 +186,7 @@ class Recursive:
 
         Args:
             record: with the model's channels. Every experiment after the first begins after a gap.
+                Rows with missing samples that were left out of a recording count all the same.
             u, y: instead of a record inputs and outputs, one row or many; NaN is a missing sample.
                 Rows that read one are left out.
             gap: whether these rows do not follow on the last ones: then the first lags are history
@@ -202,31 +203,34 @@ class Recursive:
         begins: list[bool] = []
         prepared = []
         tail = self._tail
-        for i, rows in enumerate(self._parts(record, u, y)):
+        lost, parts = self._parts(record, u, y)
+        for i, rows in enumerate(parts):
             begins.append(gap or i > 0)
             x, complete, tail = self._lagging.regressors(
                 self._lagging.nothing if begins[-1] else tail, rows
             )
             prepared.append(self._whiten(x, complete, rows))
         alarms = []
-        for begun, (used, whitened, count) in zip(begins, prepared, strict=True):
+        for begun, left_out, (used, whitened, count) in zip(begins, lost, prepared, strict=True):
             if begun:
                 self._watch.gap()
+            self.rows += left_out
             alarms += self._follow(used, whitened)
             self.rows += count
         self._tail = tail
         self.alarms = (*self.alarms, *alarms)
         return alarms
 
-    def _parts(self, record: Record | None, u: Any, y: Any) -> list[Matrix]:
-        """Yield rows (n, ny + nu) without gaps among them."""
+    def _parts(self, record: Record | None, u: Any, y: Any) -> tuple[list[int], list[Matrix]]:
+        """Return rows (n, ny + nu) without gaps among them, and how many were lost before each."""
         model = self._fitted
         if record is None:
-            return [joined_rows(u, y, len(model.inputs), len(model.outputs))]
+            return [0], [joined_rows(u, y, len(model.inputs), len(model.outputs))]
         if u is not None or y is not None:
             raise InputError("give either a record, or `u` and `y`.")
         record = model.fitting(record, need_outputs=True)
-        return [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
+        rows = [np.concatenate([e.outputs, e.inputs], axis=1) for e in record.experiments]
+        return record.lost_rows, rows
 
     def _whiten(
         self, x: Matrix, complete: Any, rows: Matrix

@@ -10,6 +10,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, show
+from orthaug._base.lines import plural
 from orthaug.data.preparation import steps_again
 from orthaug.data.record import Channel, Experiment, Preparation, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
@@ -98,7 +99,7 @@ class RecordModel(Generic[Form]):
         if len(experiment) <= first:
             name = experiment.source or "the record"
             raise InputError(
-                f"{name} has {len(experiment)} rows, too few: the first value is at row "
+                f"{name} has {plural(len(experiment), 'row')}, too few: the first value is at row "
                 f"{show(first)}."
             )
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import RankError
+from orthaug._base.lines import plural
 from orthaug.data.regressors import Layout
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.projection import Factor
@@ -101,8 +102,8 @@ def require_rank(excited: Excitation, rows: int) -> None:
     """Raise RankError where θ is not determined, naming the parameters that no data separate."""
     if rows < excited.columns:
         raise RankError(
-            f"{rows} usable rows for {excited.columns} parameters; give at least as many rows "
-            "as parameters."
+            f"{plural(rows, 'usable row')} for {excited.columns} parameters; give at least as "
+            "many rows as parameters."
         )
     if excited.full_rank:
         return

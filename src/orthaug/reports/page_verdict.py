@@ -136,6 +136,8 @@ def _agreement(result: CompareResult) -> str:
     sizes = [one for one in result.differences or () if one.of_std is not None]
     if not sizes:
         return "No parameter has a standard error, so nothing says how near the parameters are."
+    if all(one.value == 0.0 for one in result.differences or ()):
+        return "The parameters are the same."
     far = max(sizes, key=lambda one: abs(one.of_std or 0.0))
     row = next(row for row in result.comparison if row.name == far.result)
     unit = next((p.unit for p in row.parameters if p.name == far.name), "")

@@ -18,6 +18,7 @@ from orthaug._base.lines import (
     fold,
     percent,
     plain_number,
+    plural,
     table,
 )
 from orthaug.analysis.budget import SURE_SHARE
@@ -436,8 +437,8 @@ def response_text(response: Response) -> str:
 
 def scores_text(scored: Scores, outputs: Sequence[Channel], horizon: int | None) -> str:
     """Return the scores of each output; `horizon` in steps, None for a free run."""
-    kind = "free run" if horizon is None else f"{horizon} step{'s' * (horizon > 1)} ahead"
-    rows = [[f"{kind}, {scored.samples} rows", "RMSE", "NRMSE", "FIT %"]]
+    kind = "free run" if horizon is None else f"{plural(horizon, 'step')} ahead"
+    rows = [[f"{kind}, {plural(scored.samples, 'row')}", "RMSE", "NRMSE", "FIT %"]]
     for channel, *numbers in zip(outputs, scored.rmse, scored.nrmse, scored.fit, strict=True):
         rmse, nrmse, percent = ("–" if np.isnan(number) else f"{number:.6g}" for number in numbers)
         rows.append([channel.name, f"{rmse} {channel.unit}".strip(), nrmse, percent])

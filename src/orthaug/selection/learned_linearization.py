@@ -17,6 +17,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.lines import plural
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse, parse_named
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_matrix, stack_rows
@@ -111,8 +112,8 @@ def linearization_of(model: Model, record: Record) -> LearnedLinearization:
     linearization = _OF_FORM[type(model.form)](model, record)
     if len(linearization.target) < FEWEST:
         raise InputError(
-            f"the learner has a value at {len(linearization.target)} rows of the data; at "
-            f"least {FEWEST} are needed."
+            f"the learner has a value at {plural(len(linearization.target), 'row')} of the data; "
+            f"at least {FEWEST} are needed."
         )
     return linearization
 
