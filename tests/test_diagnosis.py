@@ -115,7 +115,8 @@ def test_what_no_single_input_shows_is_found_between_neighbours():
     assert found.verdict == "unmodelled" and found.predictable[0].functions > 0.9
     assert found.changes[0].kind == "learner" and found.changes[0].fall > 0.7
     noise = of(Record.from_arrays(u, a - 2 * b + 0.05 * e, inputs=names), physics)
-    assert (noise.verdict, noise.predictable[0].functions) == ("white", 0.0)
+    # Two standard errors are exceeded by chance, and then by little
+    assert noise.verdict == "white" and noise.predictable[0].functions < 0.02
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 1.0])
