@@ -21,7 +21,7 @@ from orthaug.models.model import Model
 CLEARLY = 0.1
 """Share by which one cause predicts clearly more than another."""
 
-_DRIFT, _SCHEDULED = "drift", "scheduled"
+_DRIFT, _SCHEDULED = _CHANGES = "drift", "scheduled"
 # Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
 _SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
 _LIKELY = 0.5  # p with which a family is worth a second look
@@ -122,18 +122,52 @@ def find_change(
         tests: their tests.
         others: the best terms of other kinds.
     """
-    drift = best_family([one for one in tests.beside if one.kind == _DRIFT])
-    slow = _best_scheduled(tests)
-    if slow is None and (likely := _likely_scheduled(tests)) is not None:
-        # A slow change colours the errors: filtered by that colour hardly anything of it is left
-        tests = candidates.test(likely) or tests
-        slow = _best_scheduled(tests)
-    shares = [one.share for one in (*others, drift) if one is not None]
+    known = [one.share for one in others if one is not None]
+    drift, slow = _look(tests, _DRIFT), _look(tests, _SCHEDULED)
+    if slow is None:
+        slow = _look_again(candidates, tests, _SCHEDULED)
+    if drift is None and slow is None:
+        drift = _look_again(candidates, tests, _DRIFT)
+    if drift is not None and drift.share < max(known, default=0.0):
+        drift = None
+    shares = known if drift is None else [*known, drift.share]
     if slow is not None and slow.share > (1 + CLEARLY) * max(shares, default=0.0):
         drift = slow
-    if drift is None or drift.share < max(shares, default=0.0):
-        return None
-    return _change_of(candidates, tests, drift)
+    return None if drift is None else _change_of(candidates, drift.tests, drift.best)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A family of changing parameters that is sure in tests."""
+
+    best: FamilyTest
+    tests: Tests
+
+    @property
+    def share(self) -> float:
+        return self.best.share
+
+
+def _look(tests: Tests, kind: str) -> _Seen | None:
+    """Return the family of a kind that is sure and predicts most; None without one."""
+    own = [one for one in tests.beside if one.kind == kind]
+    best = _best_scheduled(tests) if kind == _SCHEDULED else best_family(own)
+    return None if best is None else _Seen(best, tests)
+
+
+def _look_again(candidates: Candidates, tests: Tests, kind: str) -> _Seen | None:
+    """Return the family that is sure in rows filtered by the colour that its likeliest leaves.
+
+    A slow change colours the errors: filtered by that colour hardly anything of it is left. What
+    functions of signals predict better in the same rows is none.
+    """
+    likely = _likeliest(tests, kind)
+    again = None if likely is None else candidates.test(likely)
+    found = None if again is None else _look(again, kind)
+    if found is None or kind == _SCHEDULED:
+        return found
+    other = best_family([one for one in found.tests.beside if one.kind not in _CHANGES])
+    return None if other is not None and other.share > found.share else found
 
 
 def _best_scheduled(tests: Tests) -> FamilyTest | None:
@@ -147,10 +181,10 @@ def _best_scheduled(tests: Tests) -> FamilyTest | None:
     )
 
 
-def _likely_scheduled(tests: Tests) -> FamilyTest | None:
-    """Return the family of a parameter that most likely follows a signal; None if by chance."""
-    scheduled = [one for one in tests.beside if one.kind == _SCHEDULED and one.p < _LIKELY]
-    return max(scheduled, key=lambda one: one.share, default=None)
+def _likeliest(tests: Tests, kind: str) -> FamilyTest | None:
+    """Return the family of a kind that most likely is there; None where all are by chance."""
+    likely = [one for one in tests.beside if one.kind == kind and one.p < _LIKELY]
+    return max(likely, key=lambda one: one.share, default=None)
 
 
 def _scheduled_by(one: FamilyTest) -> tuple[str, str]:
