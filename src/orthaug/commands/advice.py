@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from orthaug._base.errors import InputError
@@ -48,6 +48,8 @@ class Proposal:
     """A parameter that has to be positive, such as the size of a dead zone."""
     step: Any = None
     """Step of preparation that the change adds: the rows of the trial have the others already."""
+    restarts: bool = False
+    """True if it changes initial values alone."""
     ahead: tuple[float, float] | None = None
     """What errors' past does not predict of them, without the change and with it, where that shows
     it: beside slow disturbances its gain in a free run is hidden."""
@@ -308,6 +310,7 @@ _TAMED = 0.1  # of the error of a run that runs away, above which one still runs
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
+_LARGE_GAIN = 3.0  # times the error: what lowers it by more may only have led to other values
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
 _CHANCE = (
     " It may be chance: the errors remember each other over much of the record, so that few are "
@@ -364,6 +367,8 @@ class ProposalErrors:
     proposal: Proposal
     pieces: Pieces | None
     physics_only: bool = False
+    initials: dict[str, Any] = field(default_factory=dict)
+    """The change of the unchanged spec by which its parameters begin where this fit ended."""
 
     @property
     def error(self) -> float:
@@ -401,8 +406,8 @@ class Trials:
         variant: Variant,
         accepts: Callable[[Any], bool] = lambda fit: True,
         step: Any = None,
-    ) -> Pieces | None:
-        """Return the squared errors of the free run of a job's model.
+    ) -> tuple[Pieces, Any] | None:
+        """Return the squared errors of the free run of a job's model, and its fit.
 
         None where training failed, or the fit is not accepted.
 
@@ -414,7 +419,7 @@ class Trials:
             fit = job.fold_fit(variant, briefly=True)(rows.training)
             if not fit.status.ok or not accepts(fit):
                 return None
-            return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips)
+            return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips), fit
         except InputError as error:
             LOG.info("a change was not tried: %s", error)
             return None
@@ -428,8 +433,35 @@ class Trials:
             return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
         kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
-        pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
-        return ProposalErrors(proposal, pieces, physics_only)
+        made = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
+        if made is None:
+            return ProposalErrors(proposal, None, physics_only)
+        initials = self.job.physics.with_initials(self.job, made[1])
+        return ProposalErrors(proposal, made[0], physics_only, initials)
+
+    def restarted(self, base: Pieces, tried: list[ProposalErrors]) -> list[ProposalErrors]:
+        """Return the trials, less those that only led the unchanged spec to a better solution.
+
+        A change with a large gain may owe it to other values of the parameters that both have: the
+        unchanged spec is trained once more from these, and takes the place of what gains no more.
+        """
+        before = math.sqrt(mean_square(base))
+        fitted = [one for one in tried if one.pieces and one.initials and one.proposal.step is None]
+        best = min(fitted, key=lambda one: one.error, default=None)
+        if best is None or not before > _LARGE_GAIN * best.error:
+            return tried
+        listed = join_words(
+            [f"{key.split('.')[-2]} = {value:.4g}" for key, value in best.initials.items()]
+        )
+        words = f"the initial values {listed}"
+        again = self.of(Proposal(words, best.initials, restarts=True), physics_only=False)
+        own = again.pieces
+        if own is None or not again.error < (min(before, _NO_BETTER) + best.error) / 2:
+            return tried
+        if _ratio(own, base).code != "helps":
+            return tried
+        more = [one for one in tried if one.pieces and _ratio(one.pieces, own).code == "helps"]
+        return [again, *more]
 
 
 def apply_change(declaration: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
@@ -465,9 +497,10 @@ def advise(
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))
-    base = trials.run(trials.changed_job({}), variant)
-    if base is None:
+    made = trials.run(trials.changed_job({}), variant)
+    if made is None:
         return None
+    base = made[0]
     own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
     here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
     if before > _FAR_OFF * here:
@@ -481,10 +514,11 @@ def advise(
         return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(found))
     chosen = found[: job.physics.most_trials]
     tried = [trials.of(proposal, physics_only=False) for proposal in chosen]
+    tried = trials.restarted(base, tried)
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings
     )
-    return _conclude_trials(base, tried, rows, len(found) - len(tried), learns, slow=slow)
+    return _conclude_trials(base, tried, rows, len(found) - len(chosen), learns, slow=slow)
 
 
 def _conclude_trials(
@@ -575,7 +609,8 @@ def _may_be_chance(one: ProposalErrors, before: float) -> bool:
 
 def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
     alone = " of physics alone" if one.physics_only else ""
-    text = f"With {one.proposal.words} the free run{alone} on {rows.where}"
+    beside = "Training ended beside a better solution. " if one.proposal.restarts else ""
+    text = f"{beside}With {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
         return (
             f"{text} no longer diverges: its error is {_error(one.error)} of the output's "
