@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from orthaug.analysis.findings import LateInputResult
 from orthaug.commands.advice import (
     Proposal,
     ProposalErrors,
+    Trials,
     ValidationRows,
     _conclude_trials,
     _delay,
@@ -566,3 +568,90 @@ def test_friction_that_acts_as_an_input_does_is_named_and_advised_beside_it(tmp_
     advice = result["advice"][0]
     assert advice["change"]["motion.define.push"].startswith("((F + size*(sign(v))) - c*v")
     assert advice["after"] < 0.3 * advice["before"]
+
+
+TURNTABLE = """
+[data]
+sampling_time = 0.02
+inputs = ["current"]
+outputs = ["angle"]
+train = { files = ["run.csv"] }
+[motion]
+integrator = "discrete"
+[motion.states]
+phi = { next = "phi + 0.02*w", start = 0 }
+w = { next = "w + 0.02*(0.3*current - b*w)/J", start = 0 }
+[motion.outputs]
+angle = "phi"
+[motion.parameters]
+b = { initial = 0.5, min = 0 }
+J = { initial = 0.02, min = 0 }
+[learner]
+kind = "none"
+"""
+
+
+def turned(fluid: float = 0.0) -> np.ndarray:
+    """Current and angle in degrees of a turntable, with a friction that grows with the square."""
+    random, speed, angle, rows = np.random.default_rng(13), 0.0, 0.0, []
+    for current in np.repeat(random.uniform(-1.5, 2.2, 40), 25):
+        rows.append((current, angle + 0.5 * random.normal()))
+        friction = 8.7e-4 * speed + fluid * speed * abs(speed)
+        angle, speed = angle + 0.02 * speed, speed + 0.02 * (0.3 * current - friction) / 3.5e-4
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("again", "names"),
+    [
+        (0.0010, ["the initial values b = 0.00087 and J = 0.0003"]),  # all of the gain
+        (0.0100, ["the initial values b = 0.00087 and J = 0.0003", "a term"]),  # most of it
+        (0.2000, ["a term"]),  # none: the term is what helps
+        (math.nan, ["a term"]),  # no fit
+    ],
+)
+def test_what_a_better_solution_gains_is_credited_to_no_term(monkeypatch, again, names):
+    """Training ended at b = 0, far from the solution that the trial of a term reached."""
+    rng = np.random.default_rng(1)
+
+    def errors(size: float) -> list[Any]:
+        return [size**2 * rng.uniform(0.5, 1.5, 60) for _ in range(3)]
+
+    change = {"motion.parameters.b.initial": 8.7e-4, "motion.parameters.J.initial": 3e-4}
+    made: list[Proposal] = []
+
+    def of(self: Trials, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
+        made.append(proposal)
+        return ProposalErrors(proposal, None if math.isnan(again) else errors(again))
+
+    monkeypatch.setattr(Trials, "of", of)
+    none: Any = None
+    base, trials = errors(0.2), Trials(none, none, none, none, {})
+    tried = [
+        ProposalErrors(Proposal("a term", {}), errors(0.001), initials=change),
+        ProposalErrors(Proposal("a hold", {}), errors(0.3), initials={"other": 1.0}),
+    ]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    advice, _ = _conclude_trials(base, trials.restarted(base, tried), rows, 0, False, slow=False)
+    assert [proposal.change for proposal in made] == [change]
+    found = [one.text.split("With ")[1].split(" the free run")[0] for one in advice]
+    assert sorted(found, reverse=True) == names
+    assert ("beside a better solution" in " ".join(one.text for one in advice)) == (
+        len(names) > 1 or again < 0.002
+    )
+
+
+def test_a_small_gain_asks_for_no_further_fit(monkeypatch):
+    monkeypatch.setattr(Trials, "of", lambda *given, **more: pytest.fail("a fit too many"))
+    none: Any = None
+    tried = [ProposalErrors(Proposal("a term", {}), [np.full(60, 0.01)], initials={"b": 1.0})]
+    assert Trials(none, none, none, none, {}).restarted([np.full(60, 0.04)], tried) is tried
+
+
+def test_a_term_with_a_large_gain_of_its_own_is_advised(tmp_path):
+    spec = TURNTABLE.replace("0.5, min", "1e-3, min").replace("0.02, min", "4e-4, min")
+    fitted = oa.fit_spec(str(put(tmp_path, spec, turned(5e-6), "current,angle")))
+    first = fitted.result.advice[0]
+    assert "w*abs(w)" in first.text and first.after < 0.3 * first.before
+    assert not any("better solution" in one.text for one in fitted.result.advice)

@@ -1,10 +1,14 @@
 """What a fit says of causes that it cannot know: found by trials on systems that no example has."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy.signal
 from test_cli import run
 
 import orthaug as oa
+from orthaug.analysis.doubts import _names_of_experiments
 from orthaug.analysis.input_timing import LateInput, try_holds
 from orthaug.analysis.missing_terms import missing_terms
 
@@ -354,6 +358,66 @@ def test_a_parameter_that_changes_over_the_record_is_named_with_both_ends():
     begin, end = (float(text.split(word)[1].split(" at its")[0]) for word in ("from ", "begin to "))
     assert text.startswith("R seems to change")
     assert begin == pytest.approx(0.8, abs=0.06) and end == pytest.approx(1.2, abs=0.06)
+
+
+def trolley(masses: tuple[float, ...], slow: float = 0.0):
+    """A trolley's runs with loads, and an AR(0.9) disturbance of its speed."""
+    rng, records = np.random.default_rng(20), []
+    for i, mass in enumerate(masses):
+        speed, rows = 0.0, []
+        force = np.repeat(rng.uniform(-40, 40, 30), 15)
+        for value in force:
+            rows.append(speed)
+            speed += 0.05 * (value - 6 * speed) / mass
+        white = rng.normal(size=(2, len(rows)))
+        noise = 0.05 * white[0] + slow * scipy.signal.lfilter([1.0], [1, -0.9], white[1])
+        one = oa.Record.from_arrays(
+            force, np.array(rows) + noise, sampling_time=0.05, inputs=["force"], outputs=["speed"]
+        )
+        file = replace(one.experiments[0], source=f"runs/trolley{i + 1}.csv")
+        records.append(replace(one, experiments=(file,)))
+    motion = oa.Motion.from_equations(
+        [oa.State("v", "v + 0.05*(force - c*v)/m", start="speed")],
+        [oa.Output("speed", "v")],
+        [oa.PhysicalParameter("c", 3.0, min=0), oa.PhysicalParameter("m", 5.0, min=0)],
+        ["force"],
+        integrator="discrete",
+    )
+    found = oa.estimate(oa.Record.join(records), motion, learner=None).diagnose(blocks=0)
+    return {one.code: one.text for one in found.warnings}
+
+
+@pytest.mark.parametrize("masses", [(8.0, 14.0, 8.0), (8.0, 11.0)])
+def test_a_load_that_differs_between_files_is_named_with_its_values(masses):
+    """A heat that changes m was claimed, and nowhere stood in which file it is another."""
+    said = trolley(masses)
+    text = said["parameter_by_experiment"]
+    assert text.startswith("m seems to differ between experiments: m is about ")
+    for i, mass in enumerate(masses):
+        value = float(text.split(f" in trolley{i + 1}.csv")[0].split(" ")[-1])
+        assert value == pytest.approx(mass, rel=0.1)
+    assert "constant input column" in text
+    assert not {"hidden_state", "parameter_drift"} & said.keys()
+
+
+@pytest.mark.parametrize("slow", [0.0, 0.1])
+def test_equal_loads_do_not_differ(slow):
+    said = trolley((8.0, 8.0, 8.0), slow)
+    assert not {"parameter_by_experiment", "hidden_state", "parameter_drift"} & said.keys()
+
+
+def test_experiments_of_one_file_have_numbers():
+    record = oa.Record.from_arrays(np.zeros(9), np.zeros(9))
+    one = record.experiments[0]
+    several = [replace(one, source=name) for name in ("a.csv", "a.csv")]
+    several[1] = replace(several[1], first_row=40)
+    assert _names_of_experiments(replace(record, experiments=tuple(several))) == [
+        "experiment 1",
+        "experiment 2",
+    ]
+    torn = replace(several[0], offset=5, first_row=5)
+    files = (several[0], torn, replace(one, source="runs/b.csv"))
+    assert _names_of_experiments(replace(record, experiments=files)) == ["a.csv", "b.csv"]
 
 
 def test_a_product_of_state_and_input_is_tried_as_missing_physics():

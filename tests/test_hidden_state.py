@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 from test_cli import run, write_csv
 
 import orthaug as oa
 from orthaug.analysis.family_tests import Family, _test_families
+from orthaug.analysis.hidden_state import structure_test
 from orthaug.analysis.parameter_changes import _turn_of
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -161,3 +163,42 @@ def test_a_curve_that_turns_far_beyond_its_ends_has_a_value_there():
         assert _turn_of(2.0, linear, square) == pytest.approx(extreme)
     assert _turn_of(2.0, 1.0, 0.6) is None and _turn_of(2.0, 1.0, 0.1) is None
     assert _turn_of(2.0, 0.0, 0.0) is None
+
+
+def tank(fall: float, noise: np.ndarray):
+    """The test of a tank whose outlet narrows by `fall`, with what is added to its level."""
+    rows, h, level = len(noise), 1.0, []
+    q = np.repeat(np.random.default_rng(3).uniform(0.5, 1.5, rows // 40), 40)
+    for k, flow in enumerate(q):
+        level.append(h)
+        h += 0.02 * (flow - (1 - fall * k / rows) * np.sqrt(max(h, 1e-3)))
+    motion = oa.Motion.from_equations(
+        [oa.State("h", "h + (q - a*sqrt(max(h, 0.001)))/A", start="level")],
+        [oa.Output("level", "h")],
+        [oa.PhysicalParameter("a", 0.5, min=0), oa.PhysicalParameter("A", 20.0, min=0)],
+        ["q"],
+        integrator="discrete",
+    )
+    record = oa.Record.from_arrays(
+        q, np.array(level) + noise, sampling_time=1.0, inputs=["q"], outputs=["level"]
+    )
+    fit = oa.estimate(record, motion, learner=None)
+    test = structure_test(fit.model, record)
+    assert test is not None
+    return fit, test.drift
+
+
+def test_a_drift_is_seen_whose_own_colour_hides_it():
+    """The errors of an outlet that narrows are slow: filtered by that colour 1 % of them is left."""
+    fit, drift = tank(0.3, 0.02 * np.random.default_rng(1).normal(size=1600))
+    assert drift is not None and drift.place == 0 and drift.follows is None
+    begin, end = np.exp(fit.theta[0] + [drift.begin, drift.end])
+    assert begin == pytest.approx(1.0, abs=0.05) and end == pytest.approx(0.7, abs=0.03)
+    assert drift.share > 0.5
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_slow_disturbances_are_no_drift(seed):
+    """AR(0.98) on the level, as slow as the change would be."""
+    white = 0.01 * np.random.default_rng(seed).normal(size=1600)
+    assert tank(0.0, np.asarray(scipy.signal.lfilter([1.0], [1, -0.98], white)))[1] is None

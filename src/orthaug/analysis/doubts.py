@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.errors import Warning
+from orthaug._base.errors import Warning, visible
 from orthaug._base.lines import percent
 from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
@@ -24,13 +25,15 @@ if TYPE_CHECKING:
     from orthaug.analysis.family_tests import FamilyTest
     from orthaug.analysis.hidden_state import StructureTest
     from orthaug.analysis.parameter_changes import ParameterDrift
+    from orthaug.data.record import Record
 
 E = TypeVar("E", bound=Any)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
 NOISE_ONLY = (
-    *("unexplained", "parameter_drift", "quantised_output", "explains_nothing"),
+    *("unexplained", "parameter_drift", "parameter_by_experiment", "quantised_output"),
+    "explains_nothing",
     *("few_frequencies", "little_left", "output_without_learner", "hidden_state"),
 )
 """Codes of warnings that leave intervals of noise alone."""
@@ -62,9 +65,6 @@ def doubt(made: E) -> E:
 
     Its intervals are marked with what they count.
     """
-    from orthaug.analysis.hidden_state import structure_test  # slow to import
-    from orthaug.analysis.trained_start import judged_record
-
     fit, result = made.fit, made.result
     if not fit.status.ok:
         return made
@@ -72,7 +72,7 @@ def doubt(made: E) -> E:
     failed: list[Any] = []
     test = attempt(
         "the search for a hidden state",
-        lambda: structure_test(fit.model, judged_record(fit)),
+        lambda: _structure_test(fit),
         failed,
         None,
     )
@@ -92,12 +92,18 @@ def doubt(made: E) -> E:
     hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
     if test is not None and test.state is not None and _named_share(result) > _MOSTLY:
         hidden = hidden and test.state.share > _LITTLE_BESIDE * _named_share(result)
+    stepped = test is not None and test.drift is not None and bool(test.drift.each)
+    hidden = hidden and not stepped
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     if test is not None and test.drift is not None and not hidden:
         # What is far from the data, or lacks a term that is known, needs no changing parameter
         explained = test.is_far or _named_share(result) > _MOSTLY
-        if not (explained and (unmodelled or test.found)):
+        # Between experiments that differ, what follows a signal is whatever differs with it
+        explained = explained and (unmodelled or test.found)
+        if "differs_between_experiments" in known and test.drift.follows is not None:
+            explained = True
+        if not explained:
             warnings += _drifting(fit, test.drift)
     found: dict[str, Any] = {"warnings": [*result.warnings, *warnings]}
     if test is not None and test.found:
@@ -326,20 +332,39 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     )
 
 
+def _structure_test(fit: Any) -> StructureTest | None:
+    """Return the test of a fit's free run over its training data, or the segments of these."""
+    from orthaug.analysis.hidden_state import structure_test  # slow to import
+    from orthaug.analysis.trained_start import judged_record
+
+    record = judged_record(fit)
+    return structure_test(fit.model, record, by_experiment=record is fit.problem.record)
+
+
 def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
     """Return a warning of a parameter that changes over the record; none without finite values."""
     names, now = fit.problem.names, np.asarray(fit.theta, dtype=float)
     if len(names) != len(now):
         return []
     name, place = names[drift.place], np.arange(len(now)) == drift.place
+    moves = drift.each or (drift.begin, drift.end, *(() if drift.turn is None else (drift.turn,)))
     ends = [
         float(fit.problem.values_at(now + np.where(place, moved, 0.0))[drift.place])
-        for moved in (drift.begin, drift.end, *(() if drift.turn is None else (drift.turn,)))
+        for moved in moves
     ]
     if not np.isfinite(ends).all():
         return []
     beyond = "on held-out rows, beyond what its own past explains"
     share = f"which explains {percent(drift.share)} of the free run's error {beyond}"
+    if drift.each:
+        values = zip(ends, _names_of_experiments(fit.problem.record), strict=True)
+        listed = ", ".join(f"{value:.3g} in {where}" for value, where in values)
+        text = (
+            f"{name} seems to differ between experiments: {name} is about {listed}, {share}. A "
+            "load or a setting that differs? Give it as a constant input column, or fit the "
+            "experiments on their own."
+        )
+        return [Warning("parameter_by_experiment", text)]
     if drift.follows is not None:
         what = drift.follows
         text = (
@@ -357,6 +382,15 @@ def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
         "physics; or fit the begin and the end on their own."
     )
     return [Warning("parameter_drift", text)]
+
+
+def _names_of_experiments(record: Record) -> list[str]:
+    """Return the files of experiments, or their numbers where a file has several."""
+    first = [record.recordings.index(i) for i in range(record.recordings[-1] + 1)]
+    files = [visible(PurePath(record.experiments[i].source).name) for i in first]
+    if all(files) and len(set(files)) == len(files):
+        return files
+    return [f"experiment {i + 1}" for i in range(len(first))]
 
 
 def _movement_text(fit: Any, best: FamilyTest) -> str:

@@ -9,7 +9,7 @@ find one (`family_tests`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -148,10 +148,16 @@ class StructureTest:
         return self.state is not None and self.state.share > _MUCH * max(static, share)
 
 
-def structure_test(model: Model, record: Record) -> StructureTest | None:
+def structure_test(
+    model: Model, record: Record, *, by_experiment: bool = True
+) -> StructureTest | None:
     """Test what the free run of a model leaves of its training data.
 
     None where the run leaves all bounds or has no slopes, or there are too few rows.
+
+    Args:
+        by_experiment: whether parameters may differ between the record's experiments; False where
+            these are segments of one.
     """
     fitted = linear_runs(model, record, _MOST_ROWS, np.asarray(model.numbers.theta, dtype=float))
     if fitted is None:
@@ -164,7 +170,9 @@ def structure_test(model: Model, record: Record) -> StructureTest | None:
         return None
     moved = theta - np.asarray(model.numbers.theta)
     own = _base_columns(model, runs)
-    found = _structure_of(Candidates(runs, own, *_added_columns(model, runs), moved))
+    recordings = record.recordings if by_experiment else ()
+    added = _added_columns(model, runs, recordings)
+    found = _structure_of(Candidates(runs, own, *added, moved))
     if found is None:
         return None
     delayed = tuple(_equations(model).delayed(runs[0]))
@@ -426,7 +434,9 @@ def _static(values: Vector, size: float) -> list[Vector]:
     return [v, np.abs(v), v * np.abs(v), v**3, np.tanh(10 * v)]
 
 
-def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[Family], list[np.ndarray]]:
+def _added_columns(
+    model: Model, runs: list[LinearRun], recordings: Sequence[int]
+) -> tuple[list[Family], list[np.ndarray]]:
     """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
     step, signals = model.sampling_time, [_signals(model, run) for run in runs]
     names = [name for name in signals[0] if all(name in other for other in signals)]
@@ -445,7 +455,7 @@ def _added_columns(model: Model, runs: list[LinearRun]) -> tuple[list[Family], l
             families += [Family(equation, name, kind, own) for kind, own in kinds]
             for found, own, run in zip(columns, values, runs, strict=True):
                 found.append(_respond(model, run, place, own))
-    changing, moved = changing_columns(model, runs, names, signals)
+    changing, moved = changing_columns(model, runs, names, signals, recordings)
     families += changing
     for found, own in zip(columns, moved, strict=True):
         found += own

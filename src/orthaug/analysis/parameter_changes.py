@@ -1,4 +1,4 @@
-"""Parameters that change over a record: along a curve of time, or with the past of a signal.
+"""Parameters that change: along a curve of time, with a signal's past, or between experiments.
 
 A part that heats up, wears or empties changes what the physics calls a constant. To first order the
 outputs follow such a parameter as they follow the parameter itself, times what it follows; these
@@ -7,6 +7,7 @@ are families of terms beside all others (`family_tests`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,8 @@ from orthaug.models.model import Model
 CLEARLY = 0.1
 """Share by which one cause predicts clearly more than another."""
 
-_DRIFT, _SCHEDULED = "drift", "scheduled"
+_DRIFT, _SCHEDULED, _STEPPED = _CHANGES = "drift", "scheduled", "stepped"
+_MOST_EXPERIMENTS = 6  # of more, a block of held-out rows may be all that one has
 # Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
 _SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
 _LIKELY = 0.5  # p with which a family is worth a second look
@@ -34,9 +36,9 @@ class ParameterDrift:
 
     `share` of the errors is what its change predicts: a curve of the second degree over time, or a
     multiple of the slow lag `follows` of a signal's square, as of a gain that falls as its device
-    heats up. `begin` and `end` are by how much its value at either end of the record, or where
-    that lag is smallest and largest, differs from the model's, in the coordinate that is
-    estimated.
+    heats up, or a value of its own in `each` experiment. `begin` and `end` are by how much its
+    value at either end of the record, or where that lag is smallest and largest, differs from the
+    model's, in the coordinate that is estimated.
     """
 
     place: int
@@ -46,21 +48,32 @@ class ParameterDrift:
     follows: MemoryTerm | None = None
     turn: float | None = None
     """The difference where the curve turns, where that is far beyond both ends; None elsewhere."""
+    each: tuple[float, ...] = ()
+    """The differences in each experiment, where it has a value of its own in each."""
 
 
 def changing_columns(
-    model: Model, runs: list[LinearRun], names: list[str], signals: list[dict[str, Vector]]
+    model: Model,
+    runs: list[LinearRun],
+    names: list[str],
+    signals: list[dict[str, Vector]],
+    recordings: Sequence[int],
 ) -> tuple[list[Family], list[list[np.ndarray]]]:
     """Return families of parameters that change over time, and the responses of every run.
 
     Args:
         names: of the signals whose past parameters may follow.
         signals: of every run, by name.
+        recordings: of which experiment every run is a stretch, from 0.
     """
     count, step = len(model.numbers.theta), model.sampling_time
-    both = _scheduled_columns(count, step, runs, names, signals), _drift_columns(count, runs)
-    families = [family for found, _ in both for family in found]
-    return families, [a + b for a, b in zip(both[0][1], both[1][1], strict=True)]
+    kinds = (
+        _scheduled_columns(count, step, runs, names, signals),
+        _drift_columns(count, runs),
+        _stepped_columns(count, runs, recordings),
+    )
+    families = [family for found, _ in kinds for family in found]
+    return families, [sum(own, []) for own in zip(*(found for _, found in kinds), strict=True)]
 
 
 def _scheduled_columns(
@@ -106,6 +119,25 @@ def _drift_columns(
     return families, [[_changes(run, np.stack([t, t**2], axis=1))] for run, t in pairs]
 
 
+def _stepped_columns(
+    count: int, runs: list[LinearRun], recordings: Sequence[int]
+) -> tuple[list[Family], list[list[np.ndarray]]]:
+    """Return families of parameters with a value of their own in each experiment, and responses.
+
+    The first experiment has the common value. None of a single one, or of many.
+    """
+    last = max(recordings, default=0)
+    if not 1 <= last < _MOST_EXPERIMENTS or len(recordings) != len(runs):
+        return [], [[] for _ in runs]
+    families = [Family("", str(i), _STEPPED, (None,) * last) for i in range(count)]
+    found = []
+    for run, own in zip(runs, recordings, strict=True):
+        steps = np.zeros((len(run.error), last))
+        steps[:, own - 1 : own] = 1.0  # none of experiment 0
+        found.append([_changes(run, steps)])
+    return families, found
+
+
 def _changes(run: LinearRun, over_time: Matrix) -> np.ndarray:
     """Return the responses to all parameters, each changed by all k signals (T, k) in turn."""
     moved = run.changes(over_time)
@@ -122,18 +154,65 @@ def find_change(
         tests: their tests.
         others: the best terms of other kinds.
     """
-    drift = best_family([one for one in tests.beside if one.kind == _DRIFT])
-    slow = _best_scheduled(tests)
-    if slow is None and (likely := _likely_scheduled(tests)) is not None:
-        # A slow change colours the errors: filtered by that colour hardly anything of it is left
-        tests = candidates.test(likely) or tests
-        slow = _best_scheduled(tests)
-    shares = [one.share for one in (*others, drift) if one is not None]
+    known = [one.share for one in others if one is not None]
+    stepped = _look(tests, _STEPPED) or _look_again(candidates, tests, _STEPPED)
+    if stepped is not None and _is_simplest(stepped, known):
+        return _change_of(candidates, stepped.tests, stepped.best)
+    drift, slow = _look(tests, _DRIFT), _look(tests, _SCHEDULED)
+    if slow is None:
+        slow = _look_again(candidates, tests, _SCHEDULED)
+    if drift is None and slow is None:
+        drift = _look_again(candidates, tests, _DRIFT)
+    if drift is not None and drift.share < max(known, default=0.0):
+        drift = None
+    shares = known if drift is None else [*known, drift.share]
     if slow is not None and slow.share > (1 + CLEARLY) * max(shares, default=0.0):
         drift = slow
-    if drift is None or drift.share < max(shares, default=0.0):
-        return None
-    return _change_of(candidates, tests, drift)
+    return None if drift is None else _change_of(candidates, drift.tests, drift.best)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A family of changing parameters that is sure in tests."""
+
+    best: FamilyTest
+    tests: Tests
+
+    @property
+    def share(self) -> float:
+        return self.best.share
+
+
+def _is_simplest(stepped: _Seen, others: list[float]) -> bool:
+    """Return whether no drift, state or term predicts clearly more than a value in each experiment.
+
+    Shares of the tests that show it are compared, and those that were found before.
+    """
+    beside = best_family([one for one in stepped.tests.beside if one.kind != _STEPPED])
+    shares = others if beside is None else [*others, beside.share]
+    return (1 + CLEARLY) * stepped.share >= max(shares, default=0.0)
+
+
+def _look(tests: Tests, kind: str) -> _Seen | None:
+    """Return the family of a kind that is sure and predicts most; None without one."""
+    own = [one for one in tests.beside if one.kind == kind]
+    best = _best_scheduled(tests) if kind == _SCHEDULED else best_family(own)
+    return None if best is None else _Seen(best, tests)
+
+
+def _look_again(candidates: Candidates, tests: Tests, kind: str) -> _Seen | None:
+    """Return the family that is sure in rows filtered by the colour that its likeliest leaves.
+
+    A slow change colours the errors: filtered by that colour hardly anything of it is left. What
+    functions of signals predict better in the same rows is none.
+    """
+    likely = _likeliest(tests, kind)
+    again = None if likely is None else candidates.test(likely)
+    found = None if again is None else _look(again, kind)
+    if found is None or kind != _DRIFT:
+        return found
+    other = best_family([one for one in found.tests.beside if one.kind not in _CHANGES])
+    return None if other is not None and other.share > found.share else found
 
 
 def _best_scheduled(tests: Tests) -> FamilyTest | None:
@@ -147,10 +226,10 @@ def _best_scheduled(tests: Tests) -> FamilyTest | None:
     )
 
 
-def _likely_scheduled(tests: Tests) -> FamilyTest | None:
-    """Return the family of a parameter that most likely follows a signal; None if by chance."""
-    scheduled = [one for one in tests.beside if one.kind == _SCHEDULED and one.p < _LIKELY]
-    return max(scheduled, key=lambda one: one.share, default=None)
+def _likeliest(tests: Tests, kind: str) -> FamilyTest | None:
+    """Return the family of a kind that most likely is there; None where all are by chance."""
+    likely = [one for one in tests.beside if one.kind == kind and one.p < _LIKELY]
+    return max(likely, key=lambda one: one.share, default=None)
 
 
 def _scheduled_by(one: FamilyTest) -> tuple[str, str]:
@@ -163,11 +242,15 @@ def _change_of(candidates: Candidates, tests: Tests, best: FamilyTest) -> Parame
     """Return how far the parameter of a family is from the model's at either end of its change."""
     at, place, whole = candidates.places_of(best), int(best.on), tests.rows
     family = next(one for one in candidates.families if one.is_of(best))
-    chosen = [0, 1] if best.term is None else [family.terms.index(best.term)]
+    every = list(range(len(family.terms)))
+    chosen = every if best.term is None else [family.terms.index(best.term)]
     taken = [*range(tests.known), *(tests.known + at[j] for j in chosen)]
     steps = least_squares(whole[:, taken], whole[:, -1]) * tests.size[-1] / tests.size[taken]
     middle, moved = candidates.shift[place] + steps[place], steps[tests.known :]
     turn = None
+    if best.kind == _STEPPED:
+        each = (float(middle), *(float(middle + one) for one in moved))
+        return ParameterDrift(place, best.share, each[0], each[-1], each=each)
     if best.term is None:
         linear, square = moved
         ends = middle - linear + square, middle + linear + square

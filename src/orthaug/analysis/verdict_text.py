@@ -50,6 +50,7 @@ _OFF = (
     "`inconsistent`)."
 )
 _LITTLE = 0.005  # of a free run's variance: a share by its own past below that is none
+_SLIGHT_COLOUR = 0.3  # autocorrelation: larger ones do predict, if they hold over the whole record
 _COLOUR = 0.1  # of the residual's variance by its own past: from there on that bias may matter
 
 
@@ -509,10 +510,12 @@ def describe_colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, 
     clauses = []
     for test, share in zip(tests, shares, strict=True):
         if not test.practically_white():
-            past = f", and {percent(share.own_past)} of it follows from its own past"
-            past = (
-                past if share.own_past > _LITTLE else ", too little to predict it from its own past"
-            )
+            if share.own_past > _LITTLE:
+                past = f", and {percent(share.own_past)} of it follows from its own past"
+            elif test.largest_acf < _SLIGHT_COLOUR:
+                past = ", too little to predict it from its own past"
+            else:  # as after a start that is off: where it was, nothing of the rest says how
+                past = ", though its own past does not surely predict it over the whole record"
             clauses.append(
                 f"{test.name} has autocorrelations of up to {test.largest_acf:.2f} in "
                 f"magnitude{past}"
@@ -561,6 +564,6 @@ def colour_sentence(fit: MotionEstimate) -> str:
     if not given or fit.plain_covariance is not None:
         return f"{text}."
     return (
-        f"{text}. The rows are too few for robust standard errors: those given assume white errors "
-        "and are a rough guide."
+        f"{text}. There are no robust standard errors of them: those given assume white errors and "
+        "are a rough guide."
     )

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import Vector
@@ -59,6 +59,8 @@ class Proposal:
     """True if the step leaves out samples: on the others the present model is judged, too."""
     untried: str = ""
     """Why a free run would not show its effect, as a sentence; empty of what is tried."""
+    restarts: bool = False
+    """True if it changes initial values alone."""
     ahead: tuple[float, float] | None = None
     """What errors' past does not predict of them, without the change and with it, where that shows
     it: beside slow disturbances its gain in a free run is hidden."""
@@ -375,6 +377,7 @@ _TAMED = 0.1  # of the error of a run that runs away, above which one still runs
 _PIECES = 3  # of the training rows, the last of which is held out where there is no validation part
 _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone and a limit
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
+_LARGE_GAIN = 3.0  # times the error: what lowers it by more may only have led to other values
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
 _ALIKE = 0.95  # of an error: a step of preparation, which adds no parameter, is named first above
 _CHANCE = (
@@ -439,6 +442,8 @@ class ProposalErrors:
     physics_only: bool = False
     base: Pieces | None = None
     """The present model's errors on the same samples, where the proposal leaves some out."""
+    initials: dict[str, Any] = field(default_factory=dict)
+    """The change of the unchanged spec by which its parameters begin where this fit ended."""
 
     @property
     def error(self) -> float:
@@ -478,8 +483,8 @@ class Trials:
         step: Any = None,
         *,
         mends: bool = False,
-    ) -> Pieces | None:
-        """Return the squared errors of the free run of a job's model.
+    ) -> tuple[Pieces, Any] | None:
+        """Return the squared errors of the free run of a job's model, and its fit.
 
         None where training failed, or the fit is not accepted.
 
@@ -493,7 +498,7 @@ class Trials:
             fit = job.fold_fit(variant, briefly=True)(training)
             if not fit.status.ok or not accepts(fit):
                 return None
-            return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips)
+            return squared_errors(fit.model.simulate(rows.held), self.unit, rows.skips), fit
         except InputError as error:
             LOG.info("a change was not tried: %s", error)
             return None
@@ -507,11 +512,39 @@ class Trials:
             return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
         kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
-        pieces = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
-        if not proposal.mends:
-            return ProposalErrors(proposal, pieces, physics_only)
-        base = self.run(job, self.variant, step=proposal.step, mends=True)
-        return ProposalErrors(proposal, pieces, physics_only, base)
+        made = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
+        if made is None:
+            return ProposalErrors(proposal, None, physics_only)
+        initials = self.job.physics.with_initials(self.job, made[1])
+        base = None
+        if proposal.mends:
+            mended = self.run(job, self.variant, step=proposal.step, mends=True)
+            base = mended and mended[0]
+        return ProposalErrors(proposal, made[0], physics_only, base, initials)
+
+    def restarted(self, base: Pieces, tried: list[ProposalErrors]) -> list[ProposalErrors]:
+        """Return the trials, less those that only led the unchanged spec to a better solution.
+
+        A change with a large gain may owe it to other values of the parameters that both have: the
+        unchanged spec is trained once more from these, and takes the place of what gains no more.
+        """
+        before = math.sqrt(mean_square(base))
+        fitted = [one for one in tried if one.pieces and one.initials and one.proposal.step is None]
+        best = min(fitted, key=lambda one: one.error, default=None)
+        if best is None or not before > _LARGE_GAIN * best.error:
+            return tried
+        listed = join_words(
+            [f"{key.split('.')[-2]} = {value:.4g}" for key, value in best.initials.items()]
+        )
+        words = f"the initial values {listed}"
+        again = self.of(Proposal(words, best.initials, restarts=True), physics_only=False)
+        own = again.pieces
+        if own is None or not again.error < (min(before, _NO_BETTER) + best.error) / 2:
+            return tried
+        if _ratio(again, base).code != "helps":
+            return tried
+        more = [one for one in tried if one.pieces and _ratio(one, own).code == "helps"]
+        return [again, *more]
 
 
 def apply_change(declaration: dict[str, object], change: dict[str, Any]) -> dict[str, Any]:
@@ -560,9 +593,10 @@ def _tried(
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))
-    base = trials.run(trials.changed_job({}), variant)
-    if base is None:
+    made = trials.run(trials.changed_job({}), variant)
+    if made is None:
         return None
+    base = made[0]
     own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
     here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
     if before > _FAR_OFF * here:
@@ -578,6 +612,7 @@ def _tried(
     mends = any(_helps(one, base) for one in mended)  # what seems missing comes from these samples
     chosen = [] if mends else found[: job.physics.most_trials]
     tried = mended + [trials.of(proposal, physics_only=False) for proposal in chosen]
+    tried = trials.restarted(base, tried)
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings
     )
@@ -700,7 +735,8 @@ def _may_be_chance(one: ProposalErrors, before: float) -> bool:
 
 def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
     alone = " of physics alone" if one.physics_only else ""
-    text = f"With {one.proposal.words} the free run{alone} on {rows.where}"
+    beside = "Training ended beside a better solution. " if one.proposal.restarts else ""
+    text = f"{beside}With {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
         return (
             f"{text} no longer diverges: its error is {_error(one.error)} of the output's "

@@ -216,6 +216,13 @@ class JobPhysics(ABC, Generic[P, F]):
         """Return the holds of the inputs between samples that could be tried instead."""
         return ()
 
+    def with_initials(self, job: Job, fit: F) -> dict[str, Any]:
+        """Return the change of a spec by which its parameters begin at those of another fit.
+
+        Empty where initial values do not decide what is found.
+        """
+        return {}
+
     def settled(self, fit: F) -> dict[str, object]:
         """Return the values of a spec that a fit has chosen, as a change of the spec."""
         return {}

@@ -186,6 +186,15 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return ()
         return tuple(hold for hold in HOLDS if hold != self.motion.hold)
 
+    def with_initials(self, job: Job, fit: MotionEstimate) -> dict[str, Any]:
+        found = dict(zip(fit.problem.names, fit.values, strict=True))
+        declared = job.declaration.get("motion", {}).get("parameters", {})
+        return {
+            f"motion.parameters.{name}.initial": float(f"{found[name]:.6g}")
+            for name, own in declared.items()
+            if isinstance(own, dict) and name in found and np.isfinite(found[name])
+        }
+
     def settled(self, fit: MotionEstimate) -> dict[str, Any]:
         """Return the substeps of a fit, as a change of the spec: a search would cost most."""
         form = fit.model.form

@@ -297,7 +297,8 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
-    yield from (text for code, text in _UNTESTED.items() if _has_warning(result, code))
+    untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
+    yield from dict.fromkeys(untested)
     if _has_warning(result, "closed_loop"):
         yield "its data were probably recorded under feedback, which biases the estimates"
     worse = _worse(result.scores)
@@ -347,6 +348,7 @@ _UNTESTED = {
     "local_minimum": "training from other initial values explains its data better",
     "several_solutions": "other values of its parameters explain its data as well",
     "parameter_drift": "a parameter changes over its record",
+    "parameter_by_experiment": "its parameters differ between the experiments",
     "differs_between_experiments": "its parameters differ between the experiments",
     "reset_output": "an output goes on elsewhere within its record",
     "wrapped_angle": "an angle wraps in its record",

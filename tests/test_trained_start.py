@@ -1,0 +1,73 @@
+"""The free run from the start that training found, judged output by output."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import orthaug as oa
+from orthaug.analysis import trained_start
+from orthaug.analysis.trained_start import TrainedRun, from_trained_start
+
+
+def response(errors: np.ndarray) -> Any:
+    """A response of two outputs with the given errors (N, 2)."""
+    run = SimpleNamespace(
+        start=0, diverged=False, measured=errors, model=np.zeros_like(errors), y=errors
+    )
+    return SimpleNamespace(trajectories=[run], outputs=[oa.Channel("a", "m"), oa.Channel("b", "")])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        ((1.0, 0.05), (1.0, 0.002), "b is 0.002 instead of 0.05"),  # a's noise hides nothing
+        ((1.0, 0.05), (0.4, 0.04), "a [m] is 0.4 instead of 1"),
+        ((1.0, 0.05), (0.9, 0.04), None),  # neither is clearly better
+        ((1.0, 0.05), (2.0, 0.002), None),  # one is clearly worse
+        ((1.0, 0.05), (0.1, 0.1), None),
+        ((1.0, 0.0), (1.0, 0.0), None),
+    ],
+)
+def test_outputs_are_judged_by_themselves(monkeypatch, before, after, named):
+    """A noisy output hid that the run of another began off, and the output named had no gain."""
+    fit: Any = SimpleNamespace(
+        criterion=SimpleNamespace(simulates=True),
+        problem=SimpleNamespace(deviation=np.array([4.0, 4.0])),
+    )
+    signs = np.array([[1.0], [-1.0]])
+    runs = [response(signs * np.array(sizes)) for sizes in (before, after)]
+    monkeypatch.setattr(trained_start, "rms_errors", lambda run: np.abs(run.trajectories[0].y[0]))
+    other = TrainedRun(runs[1], "a poor start", "more rows")
+    monkeypatch.setattr(trained_start, "_trained_run", lambda *given: other)
+    found = from_trained_start(fit, runs[0])
+    assert (found is None) == (named is None)
+    assert found is None or (found[0] is other and f"error of {named}" in found[1].text)
+
+
+def test_a_noisy_speed_makes_no_colour_of_a_precise_angle():
+    """The start's speed is off by its noise, so the run of the angle is off by a constant after."""
+    rng, step = np.random.default_rng(5), 0.02
+    u, x, rows = np.repeat(rng.uniform(-1, 1, 60), 10), np.zeros(2), []
+    for force in u:
+        rows.append(x)
+        x = x + step * np.array([x[1], (force - 0.1 * x[1]) / 0.05])
+    noise = rng.normal(size=(600, 2)) * (0.01, 1.5)
+    record = oa.Record.from_arrays(
+        u, np.array(rows) + noise, sampling_time=step, outputs=["angle", "speed"]
+    )
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("p", "p + 0.02*w", start="angle"),
+            oa.State("w", "w + 0.02*(u - b*w)/J", start="speed"),
+        ],
+        [oa.Output("angle", "p"), oa.Output("speed", "w")],
+        [oa.PhysicalParameter(name, 0.2, min=0) for name in "bJ"],
+        ["u"],
+        integrator="discrete",
+    )
+    found = oa.estimate(record, motion, learner=None).diagnose(blocks=0)
+    texts = {warning.code: warning.text for warning in found.warnings}
+    assert found.residuals.verdict == "white" and "coloured_residual" not in texts
+    assert "its error of angle is" in texts["noisy_start"]
