@@ -512,7 +512,7 @@ def describe_colour(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, 
         if not test.practically_white():
             if share.own_past > _LITTLE:
                 past = f", and {percent(share.own_past)} of it follows from its own past"
-            elif test.largest_acf < _SLIGHT_COLOUR:
+            elif (test.largest_acf or 0.0) < _SLIGHT_COLOUR:
                 past = ", too little to predict it from its own past"
             else:  # as after a start that is off: where it was, nothing of the rest says how
                 past = ", though its own past does not surely predict it over the whole record"
