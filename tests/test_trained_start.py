@@ -1,5 +1,6 @@
 """The free run from the start that training found, judged output by output."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +9,13 @@ import pytest
 
 import orthaug as oa
 from orthaug.analysis import trained_start
-from orthaug.analysis.trained_start import TrainedRun, from_trained_start
+from orthaug.analysis.fit_findings import PartScores, ScoreResult
+from orthaug.analysis.residuals import rms_errors
+from orthaug.analysis.trained_start import (
+    TrainedRun,
+    from_trained_start,
+    local_minimum_of_start,
+)
 
 
 def response(errors: np.ndarray) -> Any:
@@ -71,3 +78,53 @@ def test_a_noisy_speed_makes_no_colour_of_a_precise_angle():
     texts = {warning.code: warning.text for warning in found.warnings}
     assert found.residuals.verdict == "white" and "coloured_residual" not in texts
     assert "its error of angle is" in texts["noisy_start"]
+
+
+def coil(curved: float = 0.0, slow: float = 0.0) -> tuple[Any, oa.Record, oa.Record]:
+    """A fit of a linear coil, its record, and one of smaller currents."""
+    rng, records = np.random.default_rng(3), []
+    for size in (1.0, 0.2):
+        x, e, rows = 0.0, 0.0, []
+        u = size * np.repeat(rng.uniform(-1, 1, 40), 15)
+        for value in u:
+            e = 0.95 * e + slow * rng.normal()
+            rows.append(x + e + 0.002 * rng.normal())
+            x += 0.1 * (value - x - curved * x**3)
+        records.append(oa.Record.from_arrays(u, np.array(rows), sampling_time=1.0))
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "x + b*u - a*x", start="y")],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter(name, 0.2, min=0) for name in "ab"],
+        ["u"],
+        integrator="discrete",
+    )
+    return oa.estimate(records[0], motion, learner=None), *records
+
+
+def warned(fit: Any, record: oa.Record, held: oa.Record, off: float = 0.0) -> list[str]:
+    """Texts on the start of a fit whose free run over its training data is off by a wave."""
+    run, after = fit.model.simulate(record), fit.model.simulate(held)
+    one = run.trajectories[0]
+    wave = off * np.sin(np.arange(len(one.model)) / 50)[:, None]
+    run = replace(run, trajectories=(replace(one, baseline=one.baseline + wave),))
+    scores = [
+        ScoreResult(rmse=size.tolist(), nrmse=(size / fit.problem.deviation).tolist())
+        for size in (rms_errors(after),)
+    ]
+    others = {"tests.last": PartScores(prediction=scores[0], simulation=scores[0])}
+    found = local_minimum_of_start(fit, fit.model.predict(record), run, others)
+    assert all(one.code == "poor_start" for one in found)
+    return [one.text for one in found]
+
+
+def test_a_run_that_is_off_where_others_are_not_began_beside_the_data():
+    """Training ended at 20 times the error that the tests had, and was called reliable."""
+    (text,) = warned(*coil(), off=0.1)
+    assert "a local minimum, at a start beside the data" in text and "over tests.last" in text
+    assert "`initial`" in text
+
+
+@pytest.mark.parametrize(("curved", "slow"), [(0.0, 0.0), (2.0, 0.0), (0.0, 0.01)])
+def test_noise_missing_physics_and_disturbances_are_no_poor_start(curved, slow):
+    """Missing physics shows at large currents, which the part that is held out does not have."""
+    assert not warned(*coil(curved, slow))

@@ -22,7 +22,7 @@ from orthaug.analysis.informative_data import explains_nothing, few_frequencies
 from orthaug.analysis.physics_findings import analyse_physics, describe_physics, imitable
 from orthaug.analysis.robustness import robust_where_asked
 from orthaug.analysis.scoring import score_part
-from orthaug.analysis.trained_start import from_trained_start
+from orthaug.analysis.trained_start import from_trained_start, local_minimum_of_start
 from orthaug.analysis.validation import (
     Trial,
     Verdict,
@@ -120,6 +120,12 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
         judged = partial(explains_nothing, part=evidence.train, parameters=estimated, driven=driven)
         other = from_trained_start(fit, run) if judged(run) else None
         warnings += judged(run if other is None else other[0].response)
+        warnings += attempt(
+            "the search for a poor start",
+            lambda: _poor_start(fit, evidence, responses, scores),
+            warnings,
+            [],
+        )
     if any(warning.code == "unstable_plant" for warning in warnings):
         warnings[:] = [warning for warning in warnings if warning.code not in _OF_UNSTABLE]
     if fit.status.ok and fields["residuals"] is not None:
@@ -142,6 +148,21 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     return Examination(
         fit, evidence, result, responses, {name: both for name, (_, both) in ran.items()}
     )
+
+
+def _poor_start(
+    fit: Estimate,
+    evidence: Evidence,
+    responses: Mapping[str, tuple[Response, Response]],
+    scores: Mapping[str, PartScores],
+) -> list[Warning]:
+    """Return the warning that training ended at a poor start; none without data held out."""
+    held_out = {name: own for name, own in scores.items() if name != evidence.train.name}
+    if evidence.train.source is not None or not held_out:
+        return []
+    ahead, run = responses[evidence.train.name]
+    other = from_trained_start(fit, run)
+    return local_minimum_of_start(fit, ahead, other[0].response if other else run, held_out)
 
 
 def _limits_described(record: Record, free_run: Response) -> list[Warning]:

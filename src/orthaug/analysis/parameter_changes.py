@@ -27,6 +27,7 @@ _MOST_EXPERIMENTS = 6  # of more, a block of held-out rows may be all that one h
 # Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
 _SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
 _LIKELY = 0.5  # p with which a family is worth a second look
+_HIDDEN_SHARE = 0.2  # least of the errors that a drift explains whose own colour hides it
 _BENT = 0.5  # of the distance of both ends: from there on a curve turns far beyond them
 
 
@@ -212,7 +213,8 @@ def _look_again(candidates: Candidates, tests: Tests, kind: str) -> _Seen | None
     if found is None or kind != _DRIFT:
         return found
     other = best_family([one for one in found.tests.beside if one.kind not in _CHANGES])
-    return None if other is not None and other.share > found.share else found
+    least = _HIDDEN_SHARE if other is None else max(other.share, _HIDDEN_SHARE)
+    return found if found.share >= least else None
 
 
 def _best_scheduled(tests: Tests) -> FamilyTest | None:

@@ -6,6 +6,7 @@ the free run chose another start: what it is judged by is the run from there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import singledispatch
 from itertools import pairwise
@@ -13,7 +14,8 @@ from itertools import pairwise
 import numpy as np
 
 from orthaug._base.checks import Matrix
-from orthaug._base.errors import Warning
+from orthaug._base.errors import InputError, Warning
+from orthaug.analysis.fit_findings import PartScores
 from orthaug.analysis.output_response import from_fitted_start
 from orthaug.analysis.residuals import rms_errors
 from orthaug.data.record import Record
@@ -23,6 +25,8 @@ from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.dynamics import Parts, Run
 from orthaug.models.response import Response
 
+_FAR_WORSE = 3.0  # times the error of other runs
+_PIECES = 4  # of an experiment, whose runs start anew
 _BY_START = 0.5  # of the error's squares: less is left where the measured start made most
 
 
@@ -75,6 +79,62 @@ def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, W
         f"the better one. Judge the model by the latter, or give `simulate` {other.remedy}."
     )
     return other, Warning("noisy_start", text)
+
+
+def local_minimum_of_start(
+    fit: Estimate, one_step: Response, free_run: Response, others: Mapping[str, PartScores]
+) -> list[Warning]:
+    """Return the warning that training ended beside the states that the data show.
+
+    A free run that is far worse than predictions, than runs over parts that were not fitted, and
+    than runs over the same rows that start anew, has good parameters and a poor start: what is
+    missing in the physics or disturbs the plant would be there in these runs, too.
+
+    Args:
+        free_run: over the training data, from the better of both starts.
+        others: scores of parts that were not fitted, by their names.
+    """
+    record = fit.problem.record
+    if not fit.criterion.simulates or fit.model.coloured or not others:
+        return []
+    size, ahead = rms_errors(free_run), rms_errors(one_step)
+    for name, scores in others.items():
+        left, share = (
+            np.array([np.nan if value is None else value for value in own or size * np.nan])
+            for own in (scores.simulation.rmse, scores.simulation.nrmse)
+        )
+        limit = np.fmax(ahead, np.maximum(left, share * fit.problem.deviation))
+        off = size > _FAR_WORSE * limit
+        if not off.any():
+            continue
+        try:
+            anew = rms_errors(fit.model.simulate(_in_pieces(record)))
+        except InputError:  # too short, or without outputs to begin from
+            return []
+        off &= size > _FAR_WORSE * anew
+        if not off.any():
+            return []
+        worst = int(np.argmax(np.where(off, size / left, -np.inf)))
+        output = free_run.outputs[worst]
+        of = f"{output.name}{' [' + output.unit + ']' if output.unit else ''}"
+        text = (
+            f"training probably ended in a local minimum, at a start beside the data: the free "
+            f"run's error of {of} is {size[worst]:.3g} over the training data, but "
+            f"{left[worst]:.3g} over {name}, and {anew[worst]:.3g} over the training data where it "
+            f"starts anew {_PIECES - 1} times. Missing physics or disturbances would be there, "
+            "too. Remedy: give the values found here as `initial`, and fit again."
+        )
+        return [Warning("poor_start", text)]
+    return []
+
+
+def _in_pieces(record: Record) -> Record:
+    """Return a record whose experiments are cut into pieces."""
+    pieces = []
+    for one in record.experiments:
+        edges = np.linspace(0, len(one), _PIECES + 1).astype(int)
+        pieces += [one.rows(int(a), int(b)) for a, b in pairwise(edges)]
+    return replace(record, experiments=tuple(pieces))
 
 
 def _unstable(segment: int, step: float) -> Warning:

@@ -346,6 +346,7 @@ _UNTESTED = {
     "output_without_learner": "an output has parameters of a learned equation, but no learner",
     "few_frequencies": "its input has too few frequencies to test the physics",
     "local_minimum": "training from other initial values explains its data better",
+    "poor_start": "its training probably ended in a local minimum",
     "several_solutions": "other values of its parameters explain its data as well",
     "parameter_drift": "a parameter changes over its record",
     "parameter_by_experiment": "its parameters differ between the experiments",
