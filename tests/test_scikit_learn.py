@@ -383,7 +383,7 @@ def test_what_a_narx_refuses_and_how(narx, records):
             lambda: clone(narx).fit(X, y, groups[:5]),
             r"`groups` has the shape \(5,\); expected one label",
         ),
-        (lambda: clone(narx).fit(X, y, np.arange(240)), "group 0 has 1 rows, too few"),
+        (lambda: clone(narx).fit(X, y, np.arange(240)), "group 0 has 1 row, too few"),
         (
             lambda: oa.AugmentedNARX(pole, score_on="both").fit(X, y),
             "`score_on` must be one of simulation, prediction",
