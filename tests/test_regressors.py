@@ -148,7 +148,7 @@ def test_too_few_rows():
     ):
         stack_rows(Record.from_arrays(y=[1.0, 2.0], source="run.csv"), (Lag("y", 2),))
     record = Record.join([Record.from_arrays(y=np.arange(9.0)), Record.from_arrays(y=[1.0])])
-    with pytest.raises(InputError, match="experiment 1 has 1 rows, too few"):
+    with pytest.raises(InputError, match="experiment 1 has 1 row, too few"):
         stack_rows(record, (Lag("y", 1),))
     assert len(stack_rows(Record.from_arrays(y=[1.0, 2.0, 3.0]), (Lag("y", 2),))) == 1
 
