@@ -55,7 +55,7 @@ class LinearRun:
     ) -> Float[np.ndarray, "T ny k"]:
         """Return Δy of k columns added to state and output of each step, from s (n0, k) = start."""
         (t, n0), k = self.states.shape, start.shape[1]
-        if not n0:
+        if not n0 or not k:
             return np.array(into_output, dtype=float)
         # The steps of √T blocks side by side: a first time for how each block's end follows its
         # beginning, from rest and from unit states, and a second time from where blocks begin
