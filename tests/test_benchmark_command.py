@@ -211,6 +211,7 @@ def test_sets_without_files_are_named_and_all_without_is_refused(tiny, data, tmp
     first, second = finite_json(done.out)["sets"]
     assert first["text"] == f"no data: other/data.csv not found in {data}"
     assert (first["models"], first["verdict"], second["text"]) == ([], None, "")
+    assert all(one["ours"] is one["verdict"] is None for one in first["verdicts"])
     refused = run("benchmark", "other", "--data", data, "--out", tmp_path / "none")
     assert refused.code == 2
     assert one_line(refused.err, "other/data.csv was not found")

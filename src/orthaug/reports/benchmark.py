@@ -80,7 +80,7 @@ class VerdictResult(Content):
     ours: Number
     published: Number
     by: str | None
-    verdict: VerdictCode
+    verdict: VerdictCode | None
 
 
 class SetResult(Content):

@@ -20,6 +20,7 @@ from orthaug.reports.benchmark import (
     FitKind,
     PublishedResult,
     SetResult,
+    VerdictCode,
     VerdictResult,
 )
 
@@ -54,8 +55,11 @@ class PublicSet:
 
     @property
     def unit(self) -> str | None:
-        """Unit of the errors; None for those of the outputs."""
-        return self.content.get("unit")
+        """Unit of the errors, by default that of the only output; None for those of several."""
+        data = self.content["data"]
+        outputs, channels = data["outputs"], data.get("channels", {})
+        only = channels.get(outputs[0], {}).get("unit") if len(outputs) == 1 else None
+        return self.content.get("unit", only)
 
     def spec(
         self, model: str, *, default: bool = False, folder: Path | None = None
@@ -139,9 +143,10 @@ class PublicSet:
             best = min(figures, key=lambda name: figures[name], default=None)
             ours = own[0].rmse if len(own) == 1 else None
             limit = None if best is None else figures[best]
+            verdict: VerdictCode | None = None  # of a set that was not measured
             if limit is None:
                 verdict = "no published figure"
-            else:
+            elif entered is not None:
                 verdict = "ahead" if ours is not None and ours < limit else "behind"
             yield VerdictResult(
                 test=test,
