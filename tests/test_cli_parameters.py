@@ -821,7 +821,16 @@ def test_a_design_of_one_input_has_the_others_as_recorded(tmp_path, monkeypatch)
     )
     Path("both.toml").write_text(f'{both}input = "force"\n')
     done = run("design", "both.toml", "--out", "u.csv")
-    assert (done.code, done.err) == (0, "note: slope: as recorded in the training data.\n")
+    note = "note: slope: as recorded in the training data.\n"
+    assert (done.code, done.err) == (0, note)
+    # With a learner what physics alone leaves is not all noise
+    learner = f'{both}input = "force"\n'.replace('kind = "none"', "hidden = [2]")
+    Path("learner.toml").write_text(learner)
+    done = run("design", "learner.toml", "--out", "u.csv", "--force")
+    assert "What the learner takes up of that is no noise" in " ".join(done.err.split())
+    Path("learner.toml").write_text(learner + "noise = 0.01\n")
+    done = run("design", "learner.toml", "--out", "u.csv", "--force")
+    assert (done.code, done.err) == (0, note)
     table = pd.read_csv("u.csv")
     np.testing.assert_allclose(table["slope"], np.resize(slope, 300))
     assert list(table.columns) == ["time", "force", "slope"] and table["force"].abs().max() <= 1

@@ -67,14 +67,18 @@ def _other_inputs(job: Job, chosen: str, samples: int) -> dict[str, np.ndarray]:
 
 
 def notes(job: Job) -> list[str]:
-    """Return notes on the inputs that are not designed."""
+    """Return notes on the inputs that are not designed, and on noise that nobody gave."""
     assert job.spec.design is not None
     others = [c.name for c in job.problem.record.inputs if c.name != job.spec.design.input]
-    return (
-        [f"note: {', '.join(others)}: as recorded in the training data."]
-        if others and job.spec.design.input
-        else []
-    )
+    found = []
+    if others and job.spec.design.input:
+        found.append(f"note: {', '.join(others)}: as recorded in the training data.")
+    if job.spec.design.noise is None and job.spec.declared_learner() is not None:
+        found.append(
+            "note: std is for noise as large as what physics alone leaves of the training data. "
+            "What the learner takes up of that is no noise: give `noise` in [design]."
+        )
+    return found
 
 
 def write(job: Job, design: Design, out: Path, *, force: bool = False) -> None:
