@@ -44,7 +44,7 @@ def narrow_screen(columns: int) -> Iterator[None]:
         _screen[0] = before
 
 
-def plural(number: float, thing: str) -> str:
+def plural(number: int | float, thing: str) -> str:
     """Return `1 sample`, `2 samples`."""
     return f"{number} {thing}" + ("" if number == 1 else "s")
 
