@@ -118,11 +118,11 @@ def local_minimum_of_start(
         output = free_run.outputs[worst]
         of = f"{output.name}{' [' + output.unit + ']' if output.unit else ''}"
         text = (
-            f"training probably ended in a local minimum, at a start beside the data: the free "
+            "training probably ended in a local minimum, at a start beside the data. The free "
             f"run's error of {of} is {size[worst]:.3g} over the training data, but "
-            f"{left[worst]:.3g} over {name}, and {anew[worst]:.3g} over the training data where it "
-            f"starts anew {_PIECES - 1} times. Missing physics or disturbances would be there, "
-            "too. Remedy: give the values found here as `initial`, and fit again."
+            f"{left[worst]:.3g} over {name}. Where it starts anew {_PIECES - 1} times, it is "
+            f"{anew[worst]:.3g} over the training data. Missing physics or disturbances would be "
+            "there, too. Remedy: give the values found here as `initial`, and fit again."
         )
         return [Warning("poor_start", text)]
     return []
