@@ -8,7 +8,7 @@ against it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -104,6 +104,8 @@ class BlockSums:
     """Gram matrices of (columns, target) over every block of rows, (blocks, m + 1, m + 1)."""
 
     grams: Float[np.ndarray, "b m+1 m+1"]
+    _beside: dict[tuple[int, ...], Vector] = field(default_factory=dict, init=False, repr=False)
+    """Squared errors by columns beside which shares were asked: many share the same."""
 
     @classmethod
     def of(cls, columns: Matrix, target: Vector, blocks: int = BLOCKS) -> BlockSums:
@@ -116,9 +118,10 @@ class BlockSums:
 
     def share(self, columns: Sequence[int], beside: Sequence[int] = ()) -> Share:
         """Return the share of the target that `columns` explain beyond those in `beside`."""
-        return Share.of(
-            self._squared_errors(list(beside)), self._squared_errors([*beside, *columns])
-        )
+        key = tuple(beside)
+        if key not in self._beside:
+            self._beside[key] = self._squared_errors(list(beside))
+        return Share.of(self._beside[key], self._squared_errors([*beside, *columns]))
 
     def _squared_errors(self, columns: list[int]) -> Vector:
         """Return each block's sum of squared errors (blocks,), by regression on the others."""
