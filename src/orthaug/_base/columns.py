@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, Vector
+from orthaug._base.checks import Matrix
 
 
 def span(columns: Matrix, rank: float = 1e-10) -> Matrix:
@@ -21,8 +21,12 @@ def span(columns: Matrix, rank: float = 1e-10) -> Matrix:
     return u[:, sigma > rank * sigma[0]]
 
 
-def least_squares(columns: Matrix, target: Vector) -> Vector:
-    """Return the coefficients of columns that express a target best, each taken as of size 1."""
+def least_squares(columns: Matrix, target: np.ndarray) -> np.ndarray:
+    """Return the coefficients of columns that express a target best, each taken as of size 1.
+
+    Args:
+        target: (N,), or several side by side (N, k), whose coefficients are then (columns, k).
+    """
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0, size, 1.0)
-    return np.linalg.lstsq(columns / size, target, rcond=1e-10)[0] / size
+    return (np.linalg.lstsq(columns / size, target, rcond=1e-10)[0].T / size).T

@@ -190,6 +190,8 @@ def _test_families(
     rest = whole[:, known:] - q @ (q.T @ whole[:, known:])
     target, terms = rest[:, -1], rest[:, :-1]
     total, left = float(target @ target), len(turn) - q.shape[1]
+    # Of the target and every term: a term beside the base moves it by its own share of them
+    solved = None if shift is None else least_squares(whole[:, base], whole[:, known:])
     sums = BlockSums.of(turn @ np.concatenate([q, terms], axis=1), turn @ whole[:, -1])
     blocks, found, place = list(range(q.shape[1])), [], 0
     for family in families:
@@ -210,8 +212,9 @@ def _test_families(
         entry = FamilyTest(
             family.equation, family.on, family.kind, share.value, share.error, float(p), term
         )
-        if shift is not None and term is not None:
-            step = least_squares(whole[:, [*base, known + chosen]], whole[:, -1])[: len(shift)]
+        if shift is not None and solved is not None and term is not None:
+            beside = (terms[:, chosen] @ target) / (terms[:, chosen] @ terms[:, chosen])
+            step = (solved[:, -1] - beside * solved[:, chosen])[: len(shift)]
             entry = replace(
                 entry, moves=tuple(map(float, shift + step * size[-1] / size[: len(shift)]))
             )
