@@ -21,18 +21,20 @@ from orthaug._base.errors import Warning as FoundWarning
 from orthaug.analysis.closed_loop import closed_loop
 from orthaug.analysis.findings import LateInputResult
 from orthaug.commands.advice import (
-    Proposal,
     ProposalErrors,
     Trials,
     ValidationRows,
     _conclude_trials,
-    _delay,
-    _noise_model,
-    _unique_proposals,
     apply_change,
-    mending_proposals,
 )
 from orthaug.commands.motion import _has_term
+from orthaug.commands.proposals import (
+    Proposal,
+    _delay,
+    _unique_proposals,
+    mending_proposals,
+    noise_model_proposals,
+)
 from orthaug.data.wild import mendings
 from orthaug.fitting.held_out import Candidate, Focus
 from orthaug.reports.page_verdict import fit_verdict
@@ -467,7 +469,7 @@ def test_a_noise_model_is_the_first_advice_where_the_free_run_is_no_better():
         compared = tuple(Candidate(focus, False, 0.3) for focus in tried)
         fit: Any = SimpleNamespace(focus=Focus("prediction", "", compared) if tried else None)
         result: Any = SimpleNamespace(warnings=[FoundWarning(code, "")])
-        return _noise_model(fit, result)
+        return noise_model_proposals(fit, result)
 
     (found,) = proposed("prediction", "simulation")
     assert found.change == {"noise.model": "auto"} and found.untried

@@ -161,8 +161,9 @@ def _poor_start(
     if evidence.train.source is not None or not held_out:
         return []
     ahead, run = responses[evidence.train.name]
-    other = from_trained_start(fit, run)
-    return local_minimum_of_start(fit, ahead, other[0].response if other else run, held_out)
+    found = local_minimum_of_start(fit, ahead, run, held_out)
+    other = from_trained_start(fit, run) if found else None  # a run more, for few fits
+    return local_minimum_of_start(fit, ahead, other[0].response, held_out) if other else found
 
 
 def _limits_described(record: Record, free_run: Response) -> list[Warning]:

@@ -9,7 +9,7 @@ changes are tried, the same on every machine; the others are only counted.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -18,357 +18,22 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug._base.progress import LOG
-from orthaug.analysis.changes import Change
-from orthaug.analysis.closed_loop import exchanged_with_output
-from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult, LateInputResult
-from orthaug.analysis.input_timing import is_stepped
-from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, declared_output
+from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
+from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
+from orthaug.commands.proposals import (
+    Proposal,
+    mending_proposals,
+    noise_model_proposals,
+    proposals,
+)
 from orthaug.commands.spec import spec_model
-from orthaug.data.preparation import STEPS, prepare
+from orthaug.data.preparation import prepare
 from orthaug.data.record import Record
-from orthaug.data.steps import Shift
-from orthaug.data.wild import mendings
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
-from orthaug.fitting.kinds import CRITERIA
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
-
-
-_TERMS = 3  # suspected terms that are proposed
-_LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
-_WIDER = 2  # times the neurons
-_ZONE = "dead_zone"
-
-
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A change of a spec: `words` that go on from "with", and the new values by their keys."""
-
-    words: str
-    change: dict[str, Any]
-    learns: bool = False
-    """True if the change is about a learner: a fit of physics alone would not show its effect."""
-    refocuses: bool = False
-    positive: str | None = None
-    """A parameter that has to be positive, such as the size of a dead zone."""
-    step: Any = None
-    """Step of preparation that the change adds: the rows of the trial have the others already."""
-    mends: bool = False
-    """True if the step leaves out samples: on the others the present model is judged, too."""
-    untried: str = ""
-    """Why a free run would not show its effect, as a sentence; empty of what is tried."""
-    restarts: bool = False
-    """True if it changes initial values alone."""
-    ahead: tuple[float, float] | None = None
-    """What errors' past does not predict of them, without the change and with it, where that shows
-    it: beside slow disturbances its gain in a free run is hidden."""
-
-    def accepts(self, fit: Any) -> bool:
-        """Return whether the result of a changed spec agrees with the words of the proposal."""
-        if self.positive is None:
-            return True
-        return bool(fit.parameters.loc[self.positive, "value"] > 0)
-
-
-def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
-    """Return the steps of preparation that warnings on the record name as their remedies.
-
-    What the record shows wrongly looks like missing physics, so these come before all others.
-    """
-    record, found = job.train.record, []
-    known = {(warning.code, warning.text) for warning in result.warnings}
-    motion = job.physics.section == "motion"
-    if any(warning.code == "exchanged_columns" for warning in result.warnings):
-        found += _exchange(job)
-    for mending in mendings(record) if job.train.source is None else ():
-        name, output = mending.step["step"], mending.output
-        if tuple(mending.warning) not in known or (name == "repeats" and not motion):
-            continue
-        steps = [*job.declaration["data"].get("prepare", []), mending.step]
-        change: dict[str, Any] = {"data.prepare": steps}
-        step = STEPS.declare(name, {k: v for k, v in mending.step.items() if k != "step"})
-        if name == "unwrap":
-            words = f'{output} unwrapped (step = "unwrap" of data.prepare)'
-            found.append(Proposal(words, change, step=step, untried=_OTHER_OUTPUT))
-            continue
-        change |= {"data.missing": "keep"} if motion else {}
-        ends = [f"{mending.step[key]:.6g}" for key in ("low", "high") if key in mending.step]
-        which = "repeats" if name == "repeats" else f"samples at {join_words(ends)}"
-        words = f'{which} of {output} marked as missing (step = "{name}" of data.prepare)'
-        found.append(Proposal(words, change, step=step, mends=True))
-    return found
-
-
-def _exchange(job: Job) -> Iterator[Proposal]:
-    """Yield the columns of the only output and of an input that seems to be its cause exchanged."""
-    record = job.train.record
-    name, output = exchanged_with_output(record), record.outputs[0]
-    given = next((channel for channel in record.inputs if channel.name == name), None)
-    if given is not None:
-        change = {
-            f"data.channels.{name}.column": output.file_column,
-            f"data.channels.{output.name}.column": given.file_column,
-        }
-        words = f"the columns of {name} and {output.name} exchanged"
-        yield Proposal(words, change, untried=_OTHER_OUTPUT)
-
-
-def _noise_model(fit: Estimate, result: FitResult) -> list[Proposal]:
-    """Return a noise model where θ is inconsistent and training on the free run is no better."""
-    compared = fit.focus is not None and fit.focus.tried("simulation")
-    if not compared or all(warning.code != "inconsistent" for warning in result.warnings):
-        return []
-    words = 'a noise model (`noise.model` = "auto")'
-    return [Proposal(words, {"noise.model": "auto"}, untried=_OTHER_NOISE)]
-
-
-def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
-    """Return what the findings of a fit suggest, the likeliest first, each once."""
-    if (
-        result.residuals is not None
-        and result.residuals.verdict == "white"
-        and not result.residuals.changes
-    ):
-        return _unique_proposals(
-            list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
-        )
-    late = list(_late_inputs(job, result))
-    if any(proposal.ahead for proposal in late):  # beside it other causes are mistaken
-        return _unique_proposals([proposal for proposal in late if proposal.ahead])
-    found = [
-        *late,
-        *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
-        *_missing_terms(job, result),
-        *_suspected_terms(job, result, fit),
-        *_predicted_changes(job, result, fit),
-        *_learner_for_equation(job, result, fit),
-        *_holds(job, result),
-    ]
-    return _unique_proposals(
-        sorted(found, key=lambda proposal: proposal.learns)
-    )  # a learner takes longest
-
-
-def _unique_proposals(found: list[Proposal]) -> list[Proposal]:
-    """Return the proposals in their order, each at the first of its places."""
-    first: dict[str, Proposal] = {}
-    for proposal in found:
-        first.setdefault(proposal.words, proposal)
-    return list(first.values())
-
-
-def _is_biased(result: FitResult) -> bool:
-    return any(
-        row.bias is not None for row in (*result.parameters, *(result.physical_parameters or ()))
-    )
-
-
-def _late_inputs(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield a lag or a shift of each input that acts late: the better, and both where alike."""
-    for late in result.residuals.late if result.residuals is not None else ():
-        kinds = (_lag, _delay) if late.by_lag else (_delay, _lag)
-        for kind in kinds if late.alike else kinds[:1]:
-            after = late.lagged if kind is _lag else late.delayed
-            shown = (float(late.declared or 0.0), float(after or 0.0)) if late.ahead else None
-            yield from (replace(proposal, ahead=shown) for proposal in kind(job, late))
-
-
-def _lag(job: Job, late: LateInputResult) -> Iterator[Proposal]:
-    """Yield a state for an input, if the physics can have one."""
-    made = job.physics.with_lag(job, late, _new_name(job, "T"))
-    if made is not None:
-        change, words = made
-        yield Proposal(words, change)
-
-
-def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
-    """Yield a shift of an input in the preparation of the data."""
-    step = Shift(late.input, late.delay)
-    steps = [dict(one) for one in job.declaration["data"].get("prepare", [])]
-    if steps and steps[-1]["step"] == "shift" and steps[-1]["channel"] == late.input:
-        steps[-1]["samples"] = round(steps[-1]["samples"] + late.delay, 10)
-    else:
-        steps.append({"step": "shift", "channel": late.input, "samples": late.delay})
-    moved = f"{plural(abs(late.delay), 'sample')} {'later' if late.delay > 0 else 'earlier'}"
-    words = f'{late.input} {moved} (step = "shift" of data.prepare)'
-    yield Proposal(words, {"data.prepare": steps}, step=step)
-
-
-def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the terms that the free run of a motion lacks."""
-    test = result.residuals.missing if result.residuals is not None else None
-    if test is None or result.residuals is None or result.residuals.verdict != "unmodelled":
-        return
-    for term in test.terms[:_TERMS]:
-        words = "a constant" if term.variable is None else ""
-        place = term.equation or term.output or term.beside
-        yield from _term(job, term.term, place, term.coefficient, words)
-
-
-def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield the suspects that explain most of the learned part, or of the physics' residual."""
-    left, found = job.physics.explained_residual(fit), []
-    for entry in result.bias or ():
-        if entry.memory is not None:  # no expression of one row is that term
-            continue
-        share, size = entry.explained, entry.coefficient_found
-        if entry.residual is not None:
-            share, size = entry.residual.share, entry.residual.coefficient
-        elif left is not None:
-            share, size = left(entry)
-        positive = entry.name.startswith(_ZONE)
-        if (share or 0.0) > _LITTLE and not (
-            positive and (size or 0.0) < 0
-        ):  # that would be no dead zone
-            found.append((share or 0.0, entry, size, positive))
-    for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
-        place, size = entry.equation or entry.output, size or entry.coefficient
-        yield from _term(job, entry.expression, place, size, "", positive=positive)
-
-
-def _term(
-    job: Job,
-    expression: str,
-    place: str | None,
-    size: float | None,
-    words: str,
-    *,
-    positive: bool = False,
-) -> Iterator[Proposal]:
-    """Yield the proposal to add a term, with its coefficient as a new parameter.
-
-    Yields nothing where the spec has the term already.
-    """
-    name = _new_name(job)
-    made = job.physics.with_term(job, name, expression, place, float(size or 0.0))
-    if made is not None:
-        change, where = made
-        what = words or f"the term {expression}"
-        yield Proposal(f"{what} {where}", change, positive=name if positive else None)
-
-
-def _new_name(job: Job, word: str = "size") -> str:
-    """Return a name for a parameter that the spec does not use."""
-    spec, number = job.spec, 1
-    taken = {*spec.data.inputs, *spec.data.outputs, *job.physics.names_taken(spec)}
-    while (name := f"{word}{number if number > 1 else ''}") in taken:
-        number += 1
-    return name
-
-
-def _predicted_changes(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield the changes of lagged physics for which its residual predicts a gain."""
-    for change in result.residuals.changes if result.residuals is not None else ():
-        if change.kind in ("input_lag", "output_lag", "offset"):
-            yield from _term(job, change.what, change.output, None, _lag_words(change))
-        elif change.kind == "learner":
-            yield from _learner(job, result, fit)
-        elif (
-            change.kind == "criterion"
-            and not _has_compared_criteria(result)
-            and change.what != CRITERIA.kind_of(fit.criterion)
-        ):
-            yield Proposal(
-                f'focus = "{change.what}"', {"training.focus": change.what}, refocuses=True
-            )
-
-
-def _has_compared_criteria(result: FitResult) -> bool:
-    """Return whether the fit itself has already tried both criteria."""
-    return result.focus is not None and bool(result.focus.candidates)
-
-
-def _lag_words(change: Change) -> str:
-    return "an offset" if change.kind == "offset" else f"the further lag {change.what}"
-
-
-def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield a learner where none was tried, one that sees more, one of more neurons."""
-    from orthaug.physics.shared import seen_columns
-
-    spec, problem, bound = job.spec, job.problem, fit.model.form.bound
-    unread = [str(lag) for lag in problem.unread_lags]
-    if unread:
-        now = spec.learner_inputs() or [str(lag) for lag in problem.layout]
-        new = {"learner.inputs": [*now, *unread]}
-        change = {"learner": {"kind": "mlp"}} if spec.declared_learner() is None else {}
-        words = f"a learner that also sees {join_words(unread)}"
-        yield Proposal(words, change | new, learns=True)
-    if spec.declared_learner() is None:
-        yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
-        return
-    if not bound.learns:  # it was tried, and physics alone was better
-        return
-    visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
-    hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
-    now = spec.learner_inputs()
-    if hidden and now is not None:
-        yield Proposal(
-            f"a learner that also sees {', '.join(hidden)}",
-            {"learner.inputs": [*now, *hidden]},
-            learns=True,
-        )
-    wild = any(warning.code == "wild_rows" for warning in result.warnings)
-    widths = getattr(bound.learner, "hidden", None)
-    if not hidden and widths and not wild:
-        wider = [_WIDER * width for width in widths]
-        yield Proposal(
-            f"a learner of {' and '.join(map(str, wider))} neurons",
-            {"learner.hidden": wider},
-            learns=True,
-        )
-
-
-def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
-    """Yield proposals of a learner in the equation of a motion that lacks something.
-
-    Where there is one already, it is given the signals that the missing part depends on.
-    """
-    test = result.residuals.missing if result.residuals is not None else None
-    if test is None or not test.terms or result.residuals is None:
-        return
-    best = test.terms[0]
-    if result.residuals.verdict != "unmodelled" or best.variable is None:
-        return
-    if job.spec.declared_learner() is None:
-        if best.beside is not None:  # of several equations that have the input
-            return
-        if best.equation is None:
-            own = declared_output(job, str(best.output))
-            learned = {f"motion.outputs.{best.output}": own | {"learned": True}}
-        else:
-            learned = {f"motion.states.{best.equation}.learned": True}
-        change = {**learned, "learner": {"inputs": list(best.variables)}}
-        seen = join_words(best.variables)
-        words = f"a learner that sees {seen} in {best.place}"
-        yield Proposal(words, change, learns=True)
-        return
-    now = job.spec.learner_inputs()
-    learned = {job.problem.motion.names_of_states[i] for i in job.problem.motion.learned[0]}
-    if not fit.learns or now is None or best.equation not in learned:
-        return
-    new = [name for name in best.variables if not _reads(now, name)]
-    if new:
-        change = {"learner.inputs": [*now, *new]}
-        yield Proposal(f"a learner that also sees {join_words(new)}", change, learns=True)
-
-
-def _reads(inputs: tuple[str, ...], variable: str) -> bool:
-    return any("".join(text.split()) == variable for text in inputs)
-
-
-def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the holds of the inputs that are not used yet."""
-    if result.residuals is None or result.residuals.verdict != "unmodelled":
-        return
-    stepped = job.train.source is None and is_stepped(job.train.record)
-    for hold in job.physics.other_holds(job.spec):
-        if stepped and hold != "zero-order":  # it would only fit better by chance
-            continue
-        yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
-
 
 # Errors over the output's deviation: of a run that says nothing, and of one that leaves the output
 _NO_BETTER, _RUNS_AWAY = (0.95, 3.0)
@@ -386,10 +51,6 @@ _CHANCE = (
 )
 _NONE_TRIED = AdviceTrialsResult(text="No change of the spec was tried.", tried=0, not_tried=0)
 _LISTED = 3  # changes without gain that the text names
-_OTHER_NOISE = (
-    "It was not tried, because it moves the parameters and their intervals more than the free run."
-)
-_OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 
 
 @dataclass(frozen=True, eq=False)
@@ -572,7 +233,7 @@ def advise(
         return None
     mending, found = mending_proposals(job, result), proposals(job, result, fit)
     untried = [proposal for proposal in mending if proposal.untried]
-    first = untried or _noise_model(fit, result)
+    first = untried or noise_model_proposals(fit, result)
     others = None if untried else _tried(job, fit, result, mending, found)
     if not first:
         return others

@@ -143,10 +143,12 @@ class GuessedMotion:
             return motion.integrator
         if motion.substeps is not None or motion.functions is not None or not self.record.even:
             return "rk4"
+        if not _STIFF <= self.substeps <= MOST_SUBSTEPS:
+            return "rk4"
         x, u = self.guessed_points
         linear = self._slopes(motion.initial, np.zeros((len(x), 1)), np.zeros((len(u), 1)))
         whole, needed = self._slopes(motion.initial, x, u), motion.scheme.first_substeps
-        if not len(linear) or not len(whole) or not _STIFF <= self.substeps <= MOST_SUBSTEPS:
+        if not len(linear) or not len(whole):
             return "rk4"
         rest = np.linalg.eigvals(whole - linear)
         few = needed(float(np.abs(rest).max(initial=0.0)) * self.record.longest_step)
