@@ -8,7 +8,9 @@ to.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.special
@@ -88,7 +90,7 @@ class Family:
         return own == (test.equation, test.on, test.kind) and test.term in self.terms
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Tests:
     """Tests of all families beside the model's columns, and beside all static ones, too.
 
@@ -97,14 +99,19 @@ class Tests:
             the errors.
         size: norms that the columns were divided by.
         beside: every family beside the model's columns.
-        hidden: every family beside these and all static ones.
+        find_hidden: tests every family beside these and all static ones.
     """
 
     rows: Matrix
     known: int
     size: Vector
     beside: list[FamilyTest]
-    hidden: list[FamilyTest]
+    find_hidden: Callable[[], list[FamilyTest]]
+
+    @cached_property
+    def hidden(self) -> list[FamilyTest]:
+        """Every family beside the model's columns and all static ones; few looks ask for them."""
+        return self.find_hidden()
 
 
 @dataclass(frozen=True)
@@ -159,9 +166,9 @@ class Candidates:
         )
         own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
         turn, reduced = np.linalg.qr(whole)  # few rows say of the columns what all rows say
-        beside = _test_families(turn, reduced, own, known, families, size, shift)
-        hidden = _test_families(turn, reduced, own + simple, known, families, size, None)
-        return Tests(whole, known, size, beside, hidden)
+        run = partial(_test_families, turn, reduced, known=known, families=families, size=size)
+        beside = run(own, shift=shift)
+        return Tests(whole, known, size, beside, partial(run, own + simple, shift=None))
 
     def places_of(self, one: FamilyTest) -> list[int]:
         """Return the places of a tested family's columns among those of all families."""
