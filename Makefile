@@ -87,4 +87,5 @@ $(STAMP): pyproject.toml constraints.txt
 	    echo "Installing the dependencies failed (all of the messages: $(LOG)). Is the package index in reach?" >&2; \
 	    exit 1; \
 	fi
+	@$(BIN)/python -m compileall -q src  # with PYTHONDONTWRITEBYTECODE every command would do it anew, for a second
 	@touch $@

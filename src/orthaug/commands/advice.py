@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
+from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
@@ -254,10 +255,16 @@ def _tried(
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))
-    made = trials.run(trials.changed_job({}), variant)
-    if made is None:
+
+    def errors_of(proposal: Proposal, _: object) -> ProposalErrors:
+        return trials.of(proposal, physics_only=False)
+
+    # Where samples are to be mended, what seems missing may come from these: it is tried after them
+    chosen = found[: job.physics.most_trials]
+    runs = iterate_results(errors_of, [Proposal("the spec as it is", {}), *(mending or chosen)])
+    base = next(runs).pieces
+    if base is None:
         return None
-    base = made[0]
     own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
     here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
     if before > _FAR_OFF * here:
@@ -269,10 +276,11 @@ def _tried(
             "not determine it, so a comparison there would say little."
         )
         return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(mending) + len(found))
-    mended = [trials.of(proposal, physics_only=False) for proposal in mending]
-    mends = any(_helps(one, base) for one in mended)  # what seems missing comes from these samples
-    chosen = [] if mends else found[: job.physics.most_trials]
-    tried = mended + [trials.of(proposal, physics_only=False) for proposal in chosen]
+    tried = list(runs)
+    if mending and any(_helps(one, base) for one in tried):
+        chosen = []
+    elif mending:
+        tried += run_all(errors_of, chosen)
     tried = trials.restarted(base, tried)
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings

@@ -106,7 +106,7 @@ def fit(
     force: Force = False,
 ) -> None:
     """Fit a spec, print a summary and write the result folder."""
-    from orthaug.commands.fit import fit_job, keep_states, write_result
+    from orthaug.commands.fit import fit_job, import_drawing, keep_states, write_result
     from orthaug.commands.folder import check_folder, check_inputs_kept
     from orthaug.commands.opening import open_job
     from orthaug.reports.text import fit_text
@@ -126,6 +126,7 @@ def fit(
 
     with training_bar(job.run_count, job.iterations, takes_a_while, rows) as progress:
         before = WATCH.rescue
+        import_drawing()
         fitted = fit_job(job, progress, keep_finished)
         WATCH.rescue = before
     if other_writes():

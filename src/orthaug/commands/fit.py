@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -206,6 +208,16 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     _draw(fitted, folder / "figures")
     Stage.REPORT.enter()
     (folder / "report.html").write_text(fit_report(fitted), encoding="utf-8")
+
+
+def import_drawing() -> None:
+    """Import what draws figures in a thread of its own, while compiled programs train."""
+    threading.Thread(target=_import_drawing, daemon=True).start()
+
+
+def _import_drawing() -> None:
+    with suppress(Exception):  # it is raised where figures are drawn
+        import orthaug.reports.drawing  # noqa: F401
 
 
 def _draw(fitted: FitReport, folder: Path) -> None:
