@@ -299,6 +299,8 @@ def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by
     assert not any("hardly distinguish" in text for text in codes.values())
     assert ("slow_input" in codes, "dead_time" in codes) == (by_lag, not by_lag)
     assert first.after < 0.1 * first.before
+    structure = fitted.result.unexplained
+    assert "hidden_state" not in codes and not (structure and structure.hidden_state)
     if by_lag:
         assert first.text.startswith("With a lag of u (the state u_late, time constant T2)")
         return

@@ -170,6 +170,114 @@ def readme(names: Names) -> Figure:
     return figure
 
 
+def fitted_example(name: str, part: str) -> tuple[Any, Any, np.ndarray | None]:
+    """Fit a spec of examples/; return it with the free run of a part and that of physics alone."""
+    import generate
+
+    import orthaug as oa
+
+    if not (ROOT / "examples" / "generated").is_dir():
+        generate.main()
+    fitted = oa.fit_spec(ROOT / "examples" / f"{name}.toml")
+    part = f"tests.{part}"
+    run = fitted.responses[part][1].trajectories[0]
+    alone = fitted.alone.get(part)
+    return fitted, run, None if alone is None else alone[1].trajectories[0].model
+
+
+def draw_runs(axis: Axes, run: Any, alone: np.ndarray | None, step: float, shown: slice) -> None:
+    """Draw the first output of free runs over its measurements, with a legend above them."""
+    time = np.arange(len(run.model))[shown] * step
+    axis.plot(time, run.measured[shown, 0], color=GREY, lw=4, label="measured")
+    if alone is not None:
+        axis.plot(time, alone[shown, 0], color=ORANGE, lw=1.2, label="physics alone")
+    axis.plot(time, run.model[shown, 0], color=BLUE, lw=1.2, label="physics and learner")
+    axis.set(xlabel="time [s]", title="free run over a record that was not fitted")
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + 0.25 * (high - low))
+    axis.legend(ncols=3, loc="upper left")
+
+
+def draw_learned(axis: Axes, fit: Any, feature: str, scale: float = 1.0, output: int = 0) -> None:
+    """Draw the learned part over one variable within the data, times a factor."""
+    from orthaug.reports.learned_part import learned_of
+
+    curve = learned_of(fit, fit.problem.record).curve(feature)
+    inside = curve.inside
+    axis.plot(curve.along[inside], scale * curve.learned[inside, output], color=BLUE, lw=2.2)
+    axis.axhline(0, color=BLACK, lw=0.6)
+
+
+@picture("gallery/dc_motor")
+def dc_motor(names: Names) -> Figure:
+    fitted, run, alone = fitted_example("dc_motor", "other_steps")
+    figure, (left, right) = two(width_ratios=(1.7, 1))
+    draw_runs(left, run, alone, 0.002, slice(0, 600))
+    left.set_ylabel("speed [rad/s]")
+    inertia = fitted.fit.parameters.loc["J", "value"]
+    draw_learned(right, fitted.fit, "w", -1e3 * inertia)
+    right.set(xlabel="speed [rad/s]", ylabel="torque [mN m]", title="friction beside the damper")
+    return figure
+
+
+@picture("gallery/two_link_arm")
+def two_link_arm(names: Names) -> Figure:
+    _, run, alone = fitted_example("two_link_arm", "other_steps")
+    figure, axes = two()
+    time, shown = np.arange(len(run.model)) * 0.02, slice(0, 300)
+    for i, axis in enumerate(axes):
+        axis.plot(time[shown], run.measured[shown, i], color=GREY, lw=4, label="measured")
+        if alone is not None:
+            axis.plot(time[shown], alone[shown, i], color=ORANGE, lw=1.2, label="physics alone")
+        axis.plot(time[shown], run.model[shown, i], color=BLUE, lw=1.2, label="with learner")
+        axis.set(xlabel="time [s]", ylabel="angle [rad]", title=("shoulder", "elbow")[i])
+    axes[0].legend()
+    return figure
+
+
+@picture("gallery/silverbox")
+def silverbox(names: Names) -> Figure:
+    fitted, run, alone = fitted_example("silverbox_motion", "arrow")
+    figure, (left, right) = two(width_ratios=(1.7, 1))
+    far = np.arange(len(run.model)) * 0.001638468
+    left.plot(far[::7], run.measured[::7, 0], color=GREY, lw=0.8, label="measured")
+    left.plot(far[::7], (run.measured - run.model)[::7, 0], color=BLUE, lw=0.8, label="error")
+    left.set(xlabel="time [s]", ylabel="voltage [V]", title="free run over the arrow")
+    left.legend(loc="upper left")
+    value = fitted.fit.parameters["value"]
+    x = np.linspace(run.measured.min(), run.measured.max(), 100)
+    spring = value["k1"] * x + value["k2"] * x**2 + value["k3"] * x**3
+    right.plot(x, spring / value["b"], color=BLUE, lw=2.2, label="spring of the equation")
+    right.plot(x, value["k1"] * x / value["b"], color=ORANGE, lw=1.2, label="its linear part")
+    right.set(xlabel="V2 [V]", ylabel="force, as V1 [V]", title="a spring that hardens")
+    right.legend()
+    return figure
+
+
+@picture("gallery/cascaded_tanks")
+def cascaded_tanks(names: Names) -> Figure:
+    _, run, alone = fitted_example("cascaded_tanks_motion", "official")
+    figure, axis = plt.subplots(figsize=(9.0, 3.0))
+    draw_runs(axis, run, alone, 4.0, slice(None))
+    axis.set(ylabel="level [V]")
+    return figure
+
+
+@picture("gallery/mr_damper")
+def mr_damper(names: Names) -> Figure:
+    fitted, run, alone = fitted_example("mr_damper_motion", "rest")
+    figure, (left, right) = two(width_ratios=(1.7, 1))
+    draw_runs(left, run, alone, 0.005, slice(0, 400))
+    left.set_ylabel("force [N]")
+    (part,) = [part for part in fitted.job.parts if part.name == "tests.rest"]
+    velocity = part.record.experiments[0].inputs[-len(run.model) :, 0]
+    right.plot(velocity[:400], run.measured[:400, 0], color=GREY, lw=3, label="measured")
+    right.plot(velocity[:400], run.model[:400, 0], color=BLUE, lw=1, label="model")
+    right.set(xlabel="velocity [cm/s]", ylabel="force [N]", title="the loop")
+    right.legend()
+    return figure
+
+
 @picture("tutorials/own_csv", blocks=1)
 def own_csv(names: Names) -> Figure:
     time = np.arange(500) / 50

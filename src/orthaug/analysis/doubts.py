@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from orthaug.data.record import Record
 
 E = TypeVar("E", bound=Any)
+F = TypeVar("F", bound=Findings)
 """An `Examination`."""
 
 _LISTED = 3  # parameters, and terms with memory
@@ -239,9 +240,9 @@ def _term_of(result: Findings, family: FamilyTest) -> str:
 
 
 def with_found_change(
-    fit: Any, result: Findings, found: str, *, nearly_all: bool = False
-) -> list[Warning]:
-    """Return the warnings after a change of the spec that lowers the error to less than a half.
+    fit: Any, result: F, found: str, *, nearly_all: bool = False
+) -> F:
+    """Return the findings after a change that lowers the error to below a half.
 
     One that took what is left for a disturbance refers to the change instead. Where the change
     explains nearly all, it is the remedy, and no state is missing.
@@ -251,28 +252,33 @@ def with_found_change(
     """
     left = _static_share(result)
     if left > _LEFT or result.unexplained is not None or not _is_disturbance(fit, result):
-        return _with_remedy(result, found) if nearly_all else list(result.warnings)
+        return _with_remedy(result, found) if nearly_all else result
     only = _ONLY if _has_intervals(result) else ""
     text = (
         f"{_more_than_noise(result)}, and physics that is missing is its likely cause. {found} "
         f"{only}Make that change, and fit again."
     )
-    return [
+    warnings = [
         Warning("unexplained", text) if warning.code == "unexplained" else warning
         for warning in result.warnings
     ]
+    return result.changed(warnings=warnings)
 
 
-def _with_remedy(result: Findings, found: str) -> list[Warning]:
-    """Return the warnings with a change as the remedy, and without a state that is missing."""
+def _with_remedy(result: F, found: str) -> F:
+    """Return the findings with a change as the remedy, and without a state that is missing."""
     done = f"{found} Make that change, and fit again."
     others = [one for one in result.warnings if one.code != "hidden_state"]
-    return [
+    warnings = [
         Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
         if one.code == "unexplained"
         else one
         for one in others
     ]
+    structure = result.unexplained
+    if structure is not None:
+        structure = structure.model_copy(update={"hidden_state": False})
+    return result.changed(warnings=warnings, unexplained=structure)
 
 
 def _more_than_noise(result: Findings) -> str:

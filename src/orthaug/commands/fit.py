@@ -95,12 +95,12 @@ def with_advice(fitted: FitReport) -> FitReport:
         "the trial of advice", lambda: advise(fitted.job, fitted.fit, fitted.result), failed, None
     )
     advice, tried = ([], None) if found is None else found
-    known = fitted.result.warnings
+    result = fitted.result
     if advice and _explains_more_than(_HALF, advice[0]):
         nearly_all = _explains_more_than(_FIFTH, advice[0])
-        known = with_found_change(fitted.fit, fitted.result, advice[0].text, nearly_all=nearly_all)
-    trials = {"warnings": [*known, *failed], "advice": advice, "advice_trials": tried}
-    return replace(fitted, result=fitted.result.changed(**trials))
+        result = with_found_change(fitted.fit, result, advice[0].text, nearly_all=nearly_all)
+    trials = {"warnings": [*result.warnings, *failed], "advice": advice, "advice_trials": tried}
+    return replace(fitted, result=result.changed(**trials))
 
 
 def _explains_more_than(left: float, advice: AdviceResult) -> bool:
