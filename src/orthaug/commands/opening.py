@@ -14,7 +14,7 @@ from orthaug.commands.lagged import LaggedPhysics
 from orthaug.commands.motion import MotionPhysics
 from orthaug.commands.parts import FilePart, load_parts
 from orthaug.commands.spec import Spec, load_spec, spec_error
-from orthaug.data.record import check_channels
+from orthaug.data.channels import check_channels
 from orthaug.fitting.rules import check_scored, check_sizes
 from orthaug.inference.kinds import MeasurePlace
 from orthaug.physics.baseline import Baseline

@@ -17,9 +17,10 @@ from orthaug._base.folders import file_digest, whole_file
 from orthaug._base.lines import percent
 from orthaug.commands.folder import results_beside
 from orthaug.commands.parts import long_stretches
+from orthaug.data.channels import Channel
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
-from orthaug.data.record import Channel, Record
+from orthaug.data.record import Record
 from orthaug.data.tables import check_readable, has_column
 from orthaug.reports.explanation import ExplainResult
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import Warning
+from orthaug.data.channels import Channel
 from orthaug.data.headers import split_header, with_unit
-from orthaug.data.record import Channel
 from orthaug.data.tables import read_titles
 
 # What engineers write, as the library of units reads it

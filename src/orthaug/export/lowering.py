@@ -11,9 +11,9 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
-from orthaug.data.record import Channel
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.beyond import FADED

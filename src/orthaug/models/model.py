@@ -18,7 +18,8 @@ from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array
 from orthaug._base.views import NotebookView
-from orthaug.data.record import Channel, Experiment, Preparation, Record
+from orthaug.data.channels import Channel
+from orthaug.data.record import Experiment, Preparation, Record
 from orthaug.models.dynamics import Numbers, Parts, Run
 from orthaug.models.kalman import Filter
 from orthaug.models.learners import Scaling

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug.data.record import Channel
+from orthaug.data.channels import Channel
 from orthaug.models.statistics import Statistics
 
 

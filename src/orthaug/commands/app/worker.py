@@ -25,8 +25,9 @@ from orthaug.commands.app.spec_text import with_value
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.job_result import check as check_job
 from orthaug.commands.opening import open_job
+from orthaug.data.channels import Channel
 from orthaug.data.columns import Column
-from orthaug.data.record import Channel, check_step
+from orthaug.data.record import check_step
 from orthaug.data.survey import Survey
 
 if TYPE_CHECKING:
