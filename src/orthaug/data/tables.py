@@ -109,15 +109,6 @@ def has_column(path: Path, name: str) -> bool:
     return True
 
 
-def column_names(path: Path) -> list[str]:
-    """Return the columns (or variables) of a file that could be read, in order.
-
-    Raises:
-        InputError: no such file, an unknown ending, content that does not fit it.
-    """
-    return read_titles(path).names
-
-
 class Titles(NamedTuple):
     """Names of the columns of a file, and the units that a row under the header gives them."""
 
