@@ -70,7 +70,6 @@ CONCEPTS = {
     "analysis.exchanged_inputs": "a mistake in the spec that the data show",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.independence": "a test of residuals",
-    "analysis.lipschitz": "how steep the predictor is",
     "analysis.observer": "the verb `observe`",
     "analysis.term_sensitivities": "slopes of a free run by terms that are added to it",
     "analysis.plant": "systems simulated for many inputs side by side",

@@ -113,7 +113,7 @@ def estimate_cells(
     """Return a value, its standard error and the two ends of its interval, with equal decimals.
 
     They have as many as show two digits of the standard error (of a quarter of the interval where
-    there is none), and a common power of ten where one is needed. A dash stands for no number.
+    there is none), and a common power of ten where one is needed. A dash means no number.
 
     Examples:
         >>> estimate_cells(0.4716983, 0.000341, (0.4710287, 0.4723671))

@@ -380,7 +380,7 @@ class Motion(NotebookView):
 
     @property
     def differences(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of names a, b whose difference a − b stands in an expression, each once.
+        """Pairs of names a, b whose difference a − b occurs in an expression, each once.
 
         Empty for a motion with functions.
         """

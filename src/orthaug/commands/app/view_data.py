@@ -376,7 +376,7 @@ class DataView:
             drawn = []
             if name in raw:
                 x = raw[name]["x"]
-                if raw[name].get("untimed"):  # its sampling time stands in the spec alone
+                if raw[name].get("untimed"):  # only the spec has its sampling time
                     x = [step * count for count in x]
                 drawn = [{**raw[name], "x": x, "name": "as measured", "raw": bool(prepared)}]
             unit = ""
