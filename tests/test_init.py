@@ -22,7 +22,7 @@ from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
-from orthaug.data.headers import with_unit
+from orthaug.data.headers import header_with_unit
 from orthaug.data.survey import channel_name, split_header, survey
 from orthaug.data.tables import read_titles
 from orthaug.selection import first_orders
@@ -462,10 +462,10 @@ def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
 
 
 def test_a_row_of_units_is_right_where_the_header_has_a_remark_in_parentheses():
-    assert split_header(with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
-    assert split_header(with_unit("Kraft (N)", "N")) == ("Kraft", "N")
-    assert split_header(with_unit("Kraft (N)", "")) == ("Kraft", "N")
-    assert split_header(with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
+    assert split_header(header_with_unit("Kraft (N)", "N")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft (N)", "")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
 
 
 def test_units_in_the_row_under_the_header(tmp_path):

@@ -291,3 +291,8 @@ def _fold(line: str, width: int) -> list[str]:
         replace_whitespace=False,
     )
     return [part.replace(_UNBROKEN, " ") for part in wrapped]
+
+
+def with_unit(name: str, unit: str | None) -> str:
+    """Return a name with its unit in brackets."""
+    return f"{name} [{unit}]" if unit else name

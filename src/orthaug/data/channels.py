@@ -16,6 +16,7 @@ from orthaug._base.checks import (
     is_number,
 )
 from orthaug._base.errors import LONGEST, InputError, show, visible
+from orthaug._base.lines import with_unit
 from orthaug.data.expressions import RESERVED, is_name
 
 _DERIVED = ("model", "baseline", "learner", "model_low", "model_high")  # columns of result tables
@@ -72,7 +73,7 @@ class Channel:
     @property
     def label(self) -> str:
         """`name [unit]`, the label of an axis."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
+        return with_unit(self.name, self.unit)
 
 
 def _quote(name: object) -> str:

@@ -300,7 +300,7 @@ def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, object]]:
     known |= {name: response.trajectories[worst].model for name, response in ran.items()}
     return [
         {
-            "label": f"{channel.name} [{channel.unit}]" if channel.unit else channel.name,
+            "label": channel.label,
             "part": part,
             "curves": [
                 {"name": name, "x": _plain(time), "y": _plain(values[own, j])}
