@@ -16,7 +16,7 @@ from safetensors.numpy import load as load_arrays
 
 from orthaug import InputError
 from orthaug.data.expressions import parse_named
-from orthaug.data.tables import column_names
+from orthaug.data.tables import read_titles
 from orthaug.models import storage
 
 ENDINGS = (".csv", ".tsv", ".npz", ".mat", ".h5", ".xlsx", ".parquet")
@@ -37,7 +37,7 @@ def header(data: bytes) -> None:
         path = Path(folder, f"run{ENDINGS[data[0] % len(ENDINGS)] if data else '.csv'}")
         path.write_bytes(data[1:])
         try:
-            column_names(path)
+            read_titles(path)
         except InputError:
             return
 

@@ -32,6 +32,7 @@ from orthaug.commands.app.gate import Gate
 from orthaug.commands.app.kept_results import keep_result, kept_results
 from orthaug.commands.app.processes import Command, Run, WorkerPool
 from orthaug.commands.app.session import Session, Sessions
+from orthaug.commands.app.uploads import begin_file, keep_file, place_for
 from orthaug.commands.app.worker import thin_curve
 from orthaug.commands.bars import training_bar
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Variant
@@ -274,12 +275,10 @@ def test_the_address_in_the_browsers_arguments_opens_the_page_once():
 
 
 def test_each_dropped_file_keeps_its_content(tmp_path):
-    session = Session("key", tmp_path, WorkerPool())
-
     def drop(name: str, content: str) -> tuple[str, str]:
-        partial = session.begin_file(name)
+        partial = begin_file(tmp_path, name)
         partial.write_text(content)
-        place, note = session.keep_file(partial, name)
+        place, note = keep_file(partial, name)
         assert place.read_text() == content and not partial.exists()
         return place.name, note
 
@@ -327,11 +326,11 @@ def test_a_file_beyond_the_limit_is_refused_before_it_comes(tmp_path, monkeypatc
 
 def test_a_session_keeps_to_its_folder(tmp_path):
     session = Session("key", tmp_path, WorkerPool())
-    assert session.place_for("../../etc/run one.csv") == tmp_path / "run one.csv"
-    assert session.place_for("C:\\data\\<b>.CSV").parent == tmp_path
+    assert place_for(tmp_path, "../../etc/run one.csv") == tmp_path / "run one.csv"
+    assert place_for(tmp_path, "C:\\data\\<b>.CSV").parent == tmp_path
     for name in ("run.exe", ".csv", "", "spec.toml"):
         with pytest.raises(InputError, match="unknown type of data file"):
-            session.place_for(name)
+            place_for(tmp_path, name)
     for name in ("../x", "spec.toml", "model.zip", "c.zip", "/etc/passwd"):
         with pytest.raises(InputError, match="there is nothing of that name yet"):
             session.download(name)
@@ -675,7 +674,7 @@ def started(tmp_path, monkeypatch) -> Iterator[Callable[..., Session]]:
 
 
 async def look(session: Session, name: str) -> None:
-    session.open_file(session.place_for(name))
+    session.open_file(place_for(session.folder, name))
     assert session._look is not None
     await session._look
 

@@ -27,8 +27,8 @@ from orthaug import (
     save,
     stability,
 )
-from orthaug.analysis import contraction as metrics
 from orthaug.analysis import feedback as radii
+from orthaug.analysis import free_run_stability as metrics
 from orthaug.analysis import lipschitz as gradients
 from orthaug.analysis.feedback import feedback
 from orthaug.analysis.findings import StabilityResult

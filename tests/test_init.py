@@ -22,9 +22,9 @@ from orthaug import load_spec
 from orthaug.commands import cli
 from orthaug.commands import init as commands_init
 from orthaug.commands.init import as_seen
-from orthaug.data.headers import with_unit
+from orthaug.data.headers import header_with_unit
 from orthaug.data.survey import channel_name, split_header, survey
-from orthaug.data.tables import column_names
+from orthaug.data.tables import read_titles
 from orthaug.selection import first_orders
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -91,7 +91,7 @@ def test_columns_of_every_kind_of_file(tmp_path):
     frame.to_parquet(tmp_path / "a.parquet")
     frame.to_excel(tmp_path / "a.xlsx", index=False)
     (tmp_path / "a.csv").write_text("u;y;\n1,5;2;\n")
-    assert [column_names(tmp_path / f"a.{end}") for end in ("parquet", "xlsx", "csv")] == [
+    assert [read_titles(tmp_path / f"a.{end}").names for end in ("parquet", "xlsx", "csv")] == [
         ["u", "y"]
     ] * 3
     wide = {
@@ -102,9 +102,9 @@ def test_columns_of_every_kind_of_file(tmp_path):
         "cube": np.ones((2, 2, 2)),
     }
     np.savez(tmp_path / "a.npz", **wide)
-    assert column_names(tmp_path / "a.npz") == ["U[0]", "U[1]", "W[0,:]", "W[1,:]", "v"]
+    assert read_titles(tmp_path / "a.npz").names == ["U[0]", "U[1]", "W[0,:]", "W[1,:]", "v"]
     scipy.io.savemat(tmp_path / "a.mat", {"data": {"u": np.ones(5)}, "v": np.ones(9), "name": "x"})
-    assert column_names(tmp_path / "a.mat") == ["data.u", "v"]
+    assert read_titles(tmp_path / "a.mat").names == ["data.u", "v"]
 
 
 def test_a_file_is_seen_and_its_spec_runs(csv, tmp_path):
@@ -462,10 +462,10 @@ def test_states_in_words_and_further_files_are_refused_with_a_remedy(tmp_path):
 
 
 def test_a_row_of_units_is_right_where_the_header_has_a_remark_in_parentheses():
-    assert split_header(with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
-    assert split_header(with_unit("Kraft (N)", "N")) == ("Kraft", "N")
-    assert split_header(with_unit("Kraft (N)", "")) == ("Kraft", "N")
-    assert split_header(with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft (Antrieb)", "N")) == ("Kraft (Antrieb)", "N")
+    assert split_header(header_with_unit("Kraft (N)", "N")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft (N)", "")) == ("Kraft", "N")
+    assert split_header(header_with_unit("Kraft [N]", "kN")) == ("Kraft", "N")
 
 
 def test_units_in_the_row_under_the_header(tmp_path):
@@ -994,14 +994,14 @@ def put_dspace(path, *, names=("Force", "Position"), rows=300):
 
 def test_signals_of_dspace_are_known_by_their_names(tmp_path):
     path, out = put_dspace(tmp_path / "run.mat"), tmp_path / "spec.toml"
-    assert column_names(path) == ["run.X.Data", "Force", "Position"]
+    assert read_titles(path).names == ["run.X.Data", "Force", "Position"]
     done = run("init", path, "--inputs", "Force", "--outputs", "Position", "--out", out)
     assert (
         done.code == 0 and "0.02 s, from column 'run.X.Data', which rises as time does" in done.out
     ), done.err
     assert tomllib.loads(out.read_text())["data"]["time"] == "run.X.Data" and "nk 3;" in done.out
     assert run("check", out).code == 0
-    assert column_names(put_dspace(tmp_path / "b.mat", names=("In", "In"))) == [
+    assert read_titles(put_dspace(tmp_path / "b.mat", names=("In", "In"))).names == [
         "run.X.Data", "run.Y[0].Data", "run.Y[1].Data"
     ]  # fmt: skip
 

@@ -14,7 +14,7 @@ from orthaug import InputError
 from orthaug.data import tables
 from orthaug.data.layouts import layout
 from orthaug.data.survey import survey
-from orthaug.data.tables import check_readable, column_names, has_column, read_table
+from orthaug.data.tables import check_readable, has_column, read_table, read_titles
 
 
 def put(folder: Path, name: str, content: str | bytes) -> Path:
@@ -76,7 +76,7 @@ def test_csv_as_it_is_found(tmp_path, content):
 )
 def test_names_may_stand_behind_the_sign_of_a_remark(tmp_path, content, names):
     """As NumPy writes them: the last line before the numbers is the header."""
-    assert column_names(put(tmp_path, "run.csv", content)) == names
+    assert read_titles(put(tmp_path, "run.csv", content)).names == names
 
 
 def test_numpy_and_pandas_read_the_same_numbers(tmp_path, monkeypatch):
@@ -142,7 +142,7 @@ def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, 
 def test_lines_that_excel_padded_above_the_header_are_no_header(tmp_path, above, units):
     header = "Zeit;Druck (Luft);Weg\n"
     path = put(tmp_path, "run.csv", f"{above}{header}{units}0,0;1;2\n0,1;3;4,5\n0,2;;\n")
-    assert column_names(path) == ["Zeit", "Druck (Luft)", "Weg"]
+    assert read_titles(path).names == ["Zeit", "Druck (Luft)", "Weg"]
     assert values(path, "Druck (Luft)", "Weg") == [[1.0, 3.0], [2.0, 4.5]]
     table = read_table(path, ["Weg"])
     assert table.first_line == f"{above}{header}{units}".count("\n") + 1
@@ -155,7 +155,7 @@ def test_lines_above_the_header_of_a_worksheet(tmp_path):
     for row in ([], ["Messung 7"], ["Stand", 4], [], ["t", "u", "y"], [0, 1, 2], [1, None, 4]):
         book.active.append(row)
     book.save(tmp_path / "run.xlsx")
-    assert column_names(tmp_path / "run.xlsx") == ["t", "u", "y"]
+    assert read_titles(tmp_path / "run.xlsx").names == ["t", "u", "y"]
     table = read_table(tmp_path / "run.xlsx", ["t", "y"])
     assert [table.columns[name].tolist() for name in ("t", "y")] == [[0.0, 1.0], [2.0, 4.0]]
     assert table.where(0) == "line 6 (row 0)"
@@ -163,7 +163,7 @@ def test_lines_above_the_header_of_a_worksheet(tmp_path):
 
 def test_a_row_of_units_is_not_taken_for_the_header_above_which_a_name_lacks(tmp_path):
     path = put(tmp_path, "run.csv", "t,,y\ns,V,m\n0,1,2\n1,3,4\n")
-    assert column_names(path) == ["t", "y"]
+    assert read_titles(path).names == ["t", "y"]
 
 
 UNITS_UNDER_NAMES = {
@@ -191,7 +191,7 @@ def test_a_row_of_units_under_the_header_is_no_sample(tmp_path, content, units):
     assert table.units == units
     first = 1 + next(i for i, line in enumerate(content.split("\n")) if line.startswith("20"))
     assert table.where(0) == f"line {first} (row 0)"
-    assert column_names(path)[:3] == ["t", "u", "y"]
+    assert read_titles(path).names[:3] == ["t", "u", "y"]
 
 
 def test_a_row_of_units_in_a_workbook(tmp_path):
@@ -224,7 +224,7 @@ def test_a_first_row_that_holds_no_units_stays_a_row(tmp_path, content):
 
 def test_columns_of_one_name_are_told_apart(tmp_path):
     path = put(tmp_path, "run.csv", "T [K],u,T [K],T [K]\n1,2,3,4\n")
-    assert column_names(path) == ["T [K].0", "u", "T [K].1", "T [K].2"]
+    assert read_titles(path).names == ["T [K].0", "u", "T [K].1", "T [K].2"]
     assert values(path, "T [K].0", "T [K].2", "u", "T [K].1") == [[1.0], [4.0], [2.0], [3.0]]
     with pytest.raises(InputError, match=r"no column 'T \[K\].3'"):
         read_table(path, ("T [K].3",))
@@ -299,7 +299,7 @@ def test_separators_are_known_by_the_content(tmp_path, kind, headed, ending, mon
         )
         names, content = ["Weg [mm]", "F"], f"Weg [mm]{separator}F\n{content}"
     path = put(tmp_path, f"run.{ending}", content)
-    assert column_names(path) == names
+    assert read_titles(path).names == names
     assert values(path, *names) == expected
     monkeypatch.setattr(tables, "_SMALL", 0)
     assert values(path, *names) == expected
@@ -330,7 +330,7 @@ UNNAMED = [
 @pytest.mark.parametrize(("content", "names", "expected"), UNNAMED, ids=range(len(UNNAMED)))
 def test_columns_without_names_are_numbered(tmp_path, content, names, expected):
     path = put(tmp_path, "run.dat", content)
-    assert column_names(path) == names
+    assert read_titles(path).names == names
     if expected is None:
         assert read_table(path, ["x1", "x2"], "x1").columns["x1"].tolist() == [0.0, 1.0]
         return

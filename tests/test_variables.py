@@ -13,7 +13,7 @@ import scipy.sparse
 from test_cli import run, signals
 
 from orthaug import InputError
-from orthaug.data.tables import column_names, has_column, read_table
+from orthaug.data.tables import has_column, read_table, read_titles
 from orthaug.data.variables import read_variables
 
 h5py = pytest.importorskip("h5py")
@@ -524,7 +524,12 @@ def test_signals_that_a_file_names(tmp_path):
     signals_ = np.array([("Force", u), ("", 2 * u)], dtype=[("Name", object), ("Data", object)])
     scope = {"time": u, "signals": {"label": "Speed", "values": 3 * u}}
     scipy.io.savemat(tmp_path / "run.mat", {"run": {"Y": signals_}, "scope": scope})
-    assert column_names(tmp_path / "run.mat") == ["Force", "run.Y[1].Data", "scope.time", "Speed"]
+    assert read_titles(tmp_path / "run.mat").names == [
+        "Force",
+        "run.Y[1].Data",
+        "scope.time",
+        "Speed",
+    ]
     wanted = {
         "Force": 1,
         "run.Y[0].Data": 1,

@@ -38,11 +38,11 @@ _FOR_TRACING = ("jax_debug_nans", "jax_debug_infs", "jax_disable_jit", "jax_chec
 
 
 class NotKept(Exception):
-    """Something that no digest can stand for."""
+    """A value whose content no digest can represent."""
 
 
 class Shape(NamedTuple):
-    """What a program depends on of an argument."""
+    """Properties of an argument that a program depends on."""
 
     shape: tuple[int, ...]
     kind: str
@@ -292,7 +292,7 @@ class Call:
 
     @property
     def key(self) -> Any:
-        """What a program of the function in this process depends on."""
+        """Static arguments, structure and shapes, which name its program in this process."""
         return tuple(self.static.items()), self.tree, self.shapes
 
 

@@ -113,7 +113,7 @@ def estimate_cells(
     """Return a value, its standard error and the two ends of its interval, with equal decimals.
 
     They have as many as show two digits of the standard error (of a quarter of the interval where
-    there is none), and a common power of ten where one is needed. A dash stands for no number.
+    there is none), and a common power of ten where one is needed. A dash means no number.
 
     Examples:
         >>> estimate_cells(0.4716983, 0.000341, (0.4710287, 0.4723671))
@@ -291,3 +291,8 @@ def _fold(line: str, width: int) -> list[str]:
         replace_whitespace=False,
     )
     return [part.replace(_UNBROKEN, " ") for part in wrapped]
+
+
+def with_unit(name: str, unit: str | None) -> str:
+    """Return a name with its unit in brackets."""
+    return f"{name} [{unit}]" if unit else name

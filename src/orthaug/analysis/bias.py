@@ -28,17 +28,6 @@ from orthaug.inference.linearization import Certificate, Linearization
 RemovedBy = Literal["learner", "learner and measure", "learner in part", "measure", "nothing"]
 
 
-def place_of(equation: str | None, output: str | None, beside: str | None = None) -> str:
-    """Return where a term is, in words: the equation of a state or an output, or an input."""
-    if beside is not None:
-        return f"the input {beside}"
-    return (
-        f"the equation of the output {output}"
-        if equation is None
-        else f"the equation of {equation}"
-    )
-
-
 @dataclass(frozen=True)
 class ResidualStep:
     """Effect of a term on the free run's residual beside the fit, by one Gauss-Newton step.

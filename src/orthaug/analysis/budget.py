@@ -58,7 +58,7 @@ _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
 _ALIKE = 1e-6  # of a bias
 _ALIKE_SHIFT = 0.05  # of it: terms that move the parameters alike
 _SAME = 1e-3  # of a share: terms that differ less are one term by two names
-_WHOLE = 0.95  # of what the learner found: a cause that may stand in its place
+_WHOLE = 0.95  # of what the learner found: a cause that may replace it
 _LISTED = 4  # parameters that a warning lists at most
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
 

@@ -260,17 +260,6 @@ def _shares(every: Iterable[tuple[Matrix, Matrix, Vector] | None]) -> tuple[Shar
     return _tested_share(own, others, target)
 
 
-def predicted_share(own: Matrix, others: Matrix, target: Vector) -> tuple[float, float] | None:
-    """Return the share of a target that `others` predict beside `own`, and its level.
-
-    The share is cross-validated, of what `own` leaves; the level is that of a robust Wald test.
-
-    None where there are too few rows, `own` leaves nothing, or the share is not surely large
-    enough.
-    """
-    return _enough(_tested_share(own, others, target))
-
-
 def _enough(tested: tuple[Share, float] | None) -> tuple[float, float] | None:
     """Return share and level of a test where the share is surely large enough."""
     if tested is None:

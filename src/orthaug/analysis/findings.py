@@ -9,12 +9,14 @@ from pydantic import Field
 
 from orthaug._base.content import ByName, Content, Flag, Number, Numbers, Whole
 from orthaug._base.errors import Warning
-from orthaug.analysis.bias import ResidualStep, place_of
+from orthaug.analysis.bias import ResidualStep
 from orthaug.analysis.changes import Change
 from orthaug.analysis.imitation import Alternative
 from orthaug.analysis.input_timing import HoldTrial
 from orthaug.analysis.learned_part import EquationParts
+from orthaug.analysis.lipschitz import Lipschitz
 from orthaug.analysis.missing_lags import LagTest
+from orthaug.analysis.missing_term import Placed
 from orthaug.analysis.motion_modes import Modes
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residual_tests import ResidualTestResult
@@ -145,7 +147,7 @@ class SuspectResult(Content):
         return shares | exact
 
 
-class MissingTermResult(Content):
+class MissingTermResult(Placed, Content):
     """A term that an equation of a motion may lack.
 
     `equation` is None of one of an `output`, and of one that acts as the input `beside` does.
@@ -165,16 +167,6 @@ class MissingTermResult(Content):
     """The expression without its coefficient."""
     variables: list[str] = []
     """The states and inputs that it depends on."""
-
-    @property
-    def place(self) -> str:
-        """Where the term is, in words."""
-        return place_of(self.equation, self.output, self.beside)
-
-    @property
-    def where(self) -> str:
-        """The same with its preposition."""
-        return f"{'in' if self.beside is None else 'beside'} {self.place}"
 
 
 class MissingResult(Content):
@@ -254,22 +246,6 @@ class ContractionResult(Content):
     worst: RunPoint
 
 
-class LipschitzResult(Content):
-    """The largest gradients of the one-step predictor."""
-
-    gradient: Number
-    gradient_scaled: Number
-    worst: RunPoint | None
-    phi: Number
-    phi_scaled: Number
-    phi_worst: RunPoint | None
-    weights: Number
-    weights_scaled: Number
-    weights_worst: RunPoint | None
-    rows: Whole
-    weights_rows: Whole
-
-
 class StabilityResult(Content):
     """Evidence on the free run."""
 
@@ -279,7 +255,7 @@ class StabilityResult(Content):
     contraction: ContractionResult | None
     diverges_at: Number
     searched: Number
-    lipschitz: LipschitzResult | None
+    lipschitz: Lipschitz | None
     modes: Modes | None = None
     radius_beyond: Number = None
     warnings: list[Warning]

@@ -27,6 +27,7 @@ from orthaug.fitting.whiteness import (
 
 # Rows of a regressor matrix that exist at a time: 26 columns of them stay in the cache
 _ROWS = 4096
+_BINS = 20  # at most
 _ROWS_PER_BIN = 5  # fewer would make bins of chance
 _RANK = 1e-10  # eigenvalues of a unit-diagonal Gram matrix below this, of the largest, are rounding
 
@@ -107,7 +108,6 @@ def against_input(
 def against_regressor(
     residual: Pieces,
     regressor: Pieces,
-    bins: int = 20,
     *,
     centred: bool = False,
     a: Vector | None = None,
@@ -121,14 +121,13 @@ def against_regressor(
 
     Args:
         residual, regressor: per experiment (N_i,).
-        bins: B at most; fewer where values repeat, or where bins would have fewer than 5 rows.
         centred: test against the mean of the residual instead of zero, with B − 1 degrees of
             freedom.
         a: `whitening(residual)`, where it is known already.
     """
     e, x = pieces_of(residual), np.concatenate(pieces_of(regressor))
     a = whitening_filter(e) if a is None else a
-    placed = _bins(x, bins)
+    placed = _bins(x)
     if a is None or placed is None:
         return None
     size = np.abs(np.concatenate(e)).max()
@@ -201,9 +200,9 @@ def _bin_blocks(
             yield np.column_stack([np.ones(len(target)), np.asarray(filtered), target])
 
 
-def _bins(x: Vector, bins: int) -> Int[np.ndarray, "_"] | None:
+def _bins(x: Vector) -> Int[np.ndarray, "_"] | None:
     """Return the bin of each sample, from 0; equal values share the bin of their middle rank."""
-    bins = min(bins, len(x) // _ROWS_PER_BIN)
+    bins = min(_BINS, len(x) // _ROWS_PER_BIN)
     if bins < 2 or not np.abs(x).max() < LARGEST:  # true for NaN, too
         return None
     _, place, counts = np.unique(x, return_inverse=True, return_counts=True)

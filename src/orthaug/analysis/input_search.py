@@ -133,9 +133,6 @@ SEARCH_ROWS, SEARCH_PERIODS = (512, 40)
 STARTS, FINALISTS = (6, 12)
 LEAST_GAIN = 1e-4  # of the cost, relative, for another change of a pattern
 SINGULAR = 1e12  # condition number of Φ above which neither bias nor variance is computed
-MOST_SAMPLES = 10_000_000  # of a design: its candidates take hours then
-LARGEST = 1e100  # amplitude, and one over the smallest: squares are finite
-_SIGNALS = 120  # of N samples that are held at once
 BATCH = 2_000_000  # samples that are simulated side by side
 
 # Per candidate the R of rows [Φ Δ] and of σ[Φ Δ], n = nt + 1

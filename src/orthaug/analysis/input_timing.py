@@ -253,7 +253,7 @@ class LateInput:
 
     @property
     def time_constant(self) -> float:
-        """Of the lag, in s."""
+        """Time constant of the lag in s."""
         return self.lag * self.sampling_time
 
     @property
@@ -266,7 +266,7 @@ class LateInput:
 
     @property
     def manner(self) -> str:
-        """How the input acts, in words."""
+        """Manner in which the input acts, in words."""
         if self.early:
             return f"{self.early} than recorded"
         by_lag = self.by_lag and not self.alike

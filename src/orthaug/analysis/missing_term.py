@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.bias import place_of
 from orthaug.analysis.suspects import changes_sign
 from orthaug.physics.motion import Motion
 
@@ -39,8 +38,26 @@ _AGAINST = {
 }
 
 
+class Placed:
+    """Words for the place of a term by its `equation`, `output` and `beside`."""
+
+    @property
+    def place(self: Any) -> str:
+        """Place of the term: the equation of a state or of an output, or an input."""
+        if self.beside is not None:
+            return f"the input {self.beside}"
+        if self.equation is None:
+            return f"the equation of the output {self.output}"
+        return f"the equation of {self.equation}"
+
+    @property
+    def where(self: Any) -> str:
+        """Place of the term with its preposition."""
+        return f"{'in' if self.beside is None else 'beside'} {self.place}"
+
+
 @dataclass(frozen=True)
-class MissingTerm:
+class MissingTerm(Placed):
     """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
     `equation` is None of a term of an output, which `output` names then, and of one that acts as
@@ -70,16 +87,6 @@ class MissingTerm:
     where it drives that back by way of its derivative; None where it does neither.
     """
     beside: str | None = None
-
-    @property
-    def place(self) -> str:
-        """Where the term is, in words."""
-        return place_of(self.equation, self.output, self.beside)
-
-    @property
-    def where(self) -> str:
-        """The same with its preposition."""
-        return f"{'in' if self.beside is None else 'beside'} {self.place}"
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -166,7 +173,7 @@ class Tried(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """What is known of the variables along the runs."""
+    """Largest values, signs and widths of the variables along the runs."""
 
     largest: Vector
     one_sided: list[bool]
@@ -188,7 +195,7 @@ def variables_of(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
     """Return the names of the variables of terms, and their rows (n, nx + nu) by states and inputs.
 
     They are the states and inputs that a learner may see, and differences of two of them that
-    stand in the equations.
+    occur in the equations.
     """
     every, names = (*motion.names_of_states, *motion.inputs), motion.visible
     unit = np.eye(len(every))

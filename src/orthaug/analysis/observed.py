@@ -9,7 +9,7 @@ import numpy as np
 import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.data.record import Channel
+from orthaug.data.channels import Channel
 from orthaug.fitting.whiteness import LjungBox, ljung_box
 from orthaug.models.response import BAND
 

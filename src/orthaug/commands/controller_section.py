@@ -14,7 +14,7 @@ from orthaug._base.errors import InputError
 from orthaug.commands.sections import Finite, PhysicalSection, Section
 from orthaug.physics.closed_loop import ClosedLoop, close_loop
 from orthaug.physics.controller import Controller
-from orthaug.physics.motion import State
+from orthaug.physics.states import State
 
 if TYPE_CHECKING:
     from orthaug.commands.data_sections import MotionSection

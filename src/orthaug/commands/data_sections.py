@@ -30,9 +30,10 @@ from orthaug.fitting.noise import OF_LAGGED
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_states
 from orthaug.physics.integrators import INTEGRATORS
-from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion, Output, State
+from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
+from orthaug.physics.states import Output, State
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine

@@ -357,7 +357,7 @@ def _choices(
         yield (
             "rows",
             "twice the rows",
-            lambda: _once(simulated_job(plan, planted, key, times=2), criterion),
+            lambda: _fit_from_one_start(simulated_job(plan, planted, key, times=2), criterion),
         )
     if plan.designed is not None:
         new = plan.designed
@@ -368,7 +368,7 @@ def _choices(
         )
 
 
-def _once(job: Job, criterion: Any) -> Any:
+def _fit_from_one_start(job: Job, criterion: Any) -> Any:
     """Return the fit of a job from one start."""
     return replace(job, spec=_changed(job, _ONE_START)).run(Variant(criterion=criterion))
 

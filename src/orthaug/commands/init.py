@@ -26,12 +26,13 @@ from orthaug.commands.draft_spec import (
     time_of,
     wrapped_text,
 )
+from orthaug.data.channels import Channel
 from orthaug.data.columns import Column
 from orthaug.data.gaps import filled_record, held_rows, regular_rows
 from orthaug.data.headers import is_time
 from orthaug.data.preparation import STEPS
 from orthaug.data.readers import read_record
-from orthaug.data.record import Channel, Record
+from orthaug.data.record import Record
 from orthaug.data.survey import Survey, survey
 from orthaug.data.wild import data_warnings
 from orthaug.physics.systems import System

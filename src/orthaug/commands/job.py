@@ -310,11 +310,13 @@ class Job:
         It is scored by predictions, on which the measure has no effect, or `briefly` by free runs
         only.
         """
+        from orthaug.fitting.setup import fit_fold
+
         options = self.training_options(variant.on(self.train.record))
         options["structure"] = self.spec.declared_structure(variant.structure_kind)
         options["briefly"] = briefly
-        posed, train = self.physics.fold_training(self, variant)
-        return partial(_fit_fold, posed=posed, train=train, options=options)
+        pose, train = self.physics.fold_training(self, variant)
+        return partial(fit_fold, pose=pose, train=train, options=options)
 
     def with_spec(self, spec: Spec) -> Job:
         """Return the job of another spec on the same data, to be fitted to folds of them.
@@ -474,16 +476,6 @@ class Job:
         if training.ensemble and learner is not None and fold is None:
             options["ensemble"] = True
         return options
-
-
-def _fit_fold(
-    fold: Record,
-    posed: Callable[[Record], P],
-    train: Callable[..., F],
-    options: Mapping[str, object],
-) -> F:
-    """Return the fit to a fold; a function of the module, so that it can be sent to a process."""
-    return train(posed(fold), **options)
 
 
 _YEAR_10000 = 253_402_300_800  # s since 1970

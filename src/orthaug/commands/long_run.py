@@ -13,7 +13,7 @@ import numpy as np
 
 from orthaug._base.errors import Warning
 from orthaug._base.folders import whole_file
-from orthaug.commands.run import ReadOptions, check_instants, experiment_column, held_outputs
+from orthaug.commands.run import ReadOptions, check_instants, experiment_column, measured_outputs
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.sources import Source
 from orthaug.data.tables import parquet_file
@@ -54,7 +54,7 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
 
     loaded = load(model)
     check_instants(loaded, data)
-    measured = held_outputs(loaded, data, reading)
+    measured = measured_outputs(loaded, data, reading)
     if (
         not loaded.form.separates
         or experiment_column(loaded, data)

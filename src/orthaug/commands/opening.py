@@ -14,7 +14,7 @@ from orthaug.commands.lagged import LaggedPhysics
 from orthaug.commands.motion import MotionPhysics
 from orthaug.commands.parts import FilePart, load_parts
 from orthaug.commands.spec import Spec, load_spec, spec_error
-from orthaug.data.record import check_channels
+from orthaug.data.channels import check_channels
 from orthaug.fitting.rules import check_scored, check_sizes
 from orthaug.inference.kinds import MeasurePlace
 from orthaug.physics.baseline import Baseline
@@ -53,7 +53,8 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
         step = parts[0].record.sampling_time
     with _named(path):
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
-        physics = _kind_of(spec).declare(spec, step)
+        kind = next(one for one in PHYSICS.values() if getattr(spec, one.section) is not None)
+        physics = kind.declare(spec, step)
     train, validation, tests = parts or load_parts(path, spec)
     with _named(path):
         first, least = physics.rows_needed(spec)
@@ -111,11 +112,6 @@ def pose_job(
         if part is not train:  # `pose` has looked at that
             physics.check_record(problem, part.record)
     return job
-
-
-def _kind_of(spec: Spec) -> type[JobPhysics]:
-    """Return the kind of physics that a spec declares a section of."""
-    return next(kind for kind in PHYSICS.values() if getattr(spec, kind.section) is not None)
 
 
 @contextmanager

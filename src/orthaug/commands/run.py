@@ -17,9 +17,10 @@ from orthaug._base.folders import file_digest, whole_file
 from orthaug._base.lines import percent
 from orthaug.commands.folder import results_beside
 from orthaug.commands.parts import long_stretches
+from orthaug.data.channels import Channel
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
-from orthaug.data.record import Channel, Record
+from orthaug.data.record import Record
 from orthaug.data.tables import check_readable, has_column
 from orthaug.reports.explanation import ExplainResult
 
@@ -199,7 +200,7 @@ def open_run(
             )
     if reading.prepare is None:
         check_instants(loaded, data)
-    held = held_outputs(loaded, data, reading)
+    held = measured_outputs(loaded, data, reading)
     if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
     elif held:
@@ -283,7 +284,7 @@ def check_instants(model: Model, data: Path) -> None:
         )
 
 
-def held_outputs(model: Model, data: Path, reading: ReadOptions) -> list[Channel]:
+def measured_outputs(model: Model, data: Path, reading: ReadOptions) -> list[Channel]:
     """Return the outputs that a file has columns for."""
     return [
         c for c in model.outputs if has_column(data, reading.columns.get(c.name, c.file_column))

@@ -28,7 +28,6 @@ from orthaug.reports.result import (
     CompareResult,
     DataResult,
     DifferenceResult,
-    FileResult,
     FitResult,
     RowResult,
     SettingResult,
@@ -192,14 +191,13 @@ def _read(path: Path) -> SavedResult:
 
 def _shared_parts(found: Sequence[SavedResult]) -> list[str]:
     """Return the names of the parts that have the same files and rows in every result."""
-    first, *others = ({name: _read_of(f) for name, f in o.result.data.parts.items()} for o in found)
+    first, *others = (
+        {name: [(file.sha256, file.rows) for file in files] for name, files in parts.items()}
+        for parts in (one.result.data.parts for one in found)
+    )
     names = {"train": "train", "validation": "validation"}
     shared = [name for name in first if all(other.get(name) == first[name] for other in others)]
     return [names.get(name, f"tests.{name}") for name in shared]
-
-
-def _read_of(files: Sequence[FileResult]) -> list[tuple[str, int]]:
-    return [(file.sha256, file.rows) for file in files]
 
 
 def _files_in_words(one: SavedResult) -> str:

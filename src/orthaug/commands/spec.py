@@ -44,8 +44,8 @@ from orthaug.commands.sections import (
     first_message,
     with_kinds,
 )
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import SAMPLING_TIME
-from orthaug.data.record import Channel
 from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable, is_table
 from orthaug.fitting.criteria import Criterion

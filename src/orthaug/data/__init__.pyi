@@ -1,8 +1,8 @@
+from .channels import Channel as Channel
 from .dask_source import open_frame as open_frame
 from .parquet_source import open_parquet as open_parquet
 from .preparation import prepare as prepare
 from .readers import read_record as read_record
-from .record import Channel as Channel
 from .record import Experiment as Experiment
 from .record import Record as Record
 from .regressors import Lags as Lags

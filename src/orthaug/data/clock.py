@@ -12,7 +12,14 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug.data.columns import Column
-from orthaug.data.headers import in_seconds, is_time, split_header, step_of, unit_of_time, with_unit
+from orthaug.data.headers import (
+    header_with_unit,
+    in_seconds,
+    is_time,
+    split_header,
+    step_of,
+    unit_of_time,
+)
 from orthaug.data.record import same_step
 from orthaug.data.tables import read_table, read_titles
 from orthaug.data.variables import ENDINGS, scalars
@@ -295,7 +302,9 @@ def read_clock(path: Path, apart: Collection[str] = (), *, by_content: bool = Fa
         by_content: look at columns of any name.
     """
     titles = read_titles(path)
-    titled = {n: with_unit(n, titles.units.get(n, "")) for n in titles.names if n not in apart}
+    titled = {
+        n: header_with_unit(n, titles.units.get(n, "")) for n in titles.names if n not in apart
+    }
     wanted = [n for n, t in titled.items() if by_content or is_time(t) or step_of(t, 1.0)]
     columns, values = [], {}
     if by_content and wanted:

@@ -16,7 +16,7 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import LONGEST
 from orthaug.data.expressions import SAMPLING_TIME, is_name
-from orthaug.data.headers import last_part, split_header, with_unit
+from orthaug.data.headers import header_with_unit, last_part, split_header
 from orthaug.data.steps import Outliers
 
 _INPUT = re.compile(r"^(u|u_?\d+|in|input|input_?\d+)$", re.IGNORECASE)
@@ -61,7 +61,7 @@ class Column:
     @property
     def titled(self) -> str:
         """The header with its unit, which may be in a row of units under it."""
-        return with_unit(self.header, self.unit)
+        return header_with_unit(self.header, self.unit)
 
     @property
     def finite(self) -> Vector:

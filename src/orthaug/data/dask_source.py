@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Experiment, as_channels, check_channels, check_step
+from orthaug.data.channels import Channel, as_channels, check_channels
+from orthaug.data.record import Experiment, check_step
 from orthaug.data.sources import join_pieces, stretches
 
 _NAME = "the DataFrame"

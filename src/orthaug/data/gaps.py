@@ -142,7 +142,8 @@ def complete_record(record: Record) -> Record | None:
     """
     if record.complete:
         return record
-    thinned = [_regular(experiment) for experiment in record.experiments]
+    complete = [np.isfinite(experiment.outputs).all(axis=1) for experiment in record.experiments]
+    thinned = [regular_rows(np.asarray(there)) for there in complete]
     every = {rows.step for rows in thinned if rows is not None}
     step, found = record.sampling_time, []
     if len(every) == 1 and None not in thinned:
@@ -162,10 +163,6 @@ def filled_record(record: Record) -> Record:
         return record
     filled = (replace(one, outputs=without_gaps(one.outputs)) for one in record.experiments)
     return replace(record, experiments=tuple(filled))
-
-
-def _regular(experiment: Experiment) -> slice | None:
-    return regular_rows(np.asarray(np.isfinite(experiment.outputs).all(axis=1)))
 
 
 def _every(experiment: Experiment, rows: slice) -> Experiment:

@@ -71,7 +71,7 @@ def split_header(header: str) -> tuple[str, str]:
     return header, ""
 
 
-def with_unit(header: str, unit: str) -> str:
+def header_with_unit(header: str, unit: str) -> str:
     """Return a header with the unit that is elsewhere, as under it; one of its own stays.
 
     What is in parentheses need not be a unit, as in `force (drive)`: it stays a part of the name.

@@ -17,16 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from orthaug._base.errors import InputError
+from orthaug.data.channels import Channel, as_channels, check_channels
 from orthaug.data.clock import DRIFT, JITTER
 from orthaug.data.headers import in_seconds
-from orthaug.data.record import (
-    Channel,
-    Experiment,
-    as_channels,
-    check_channels,
-    check_step,
-    same_step,
-)
+from orthaug.data.record import Experiment, check_step, same_step
 from orthaug.data.sources import join_pieces, stretches
 from orthaug.data.tables import check_present, check_readable, parquet_file
 

@@ -18,19 +18,11 @@ import numpy as np
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import InputError, MissingSampleError, show
 from orthaug._base.lines import plural
+from orthaug.data.channels import Channel, as_channels
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
 from orthaug.data.layouts import MISSING, STATES, text_number
 from orthaug.data.preparation import MENDING, STEPS, check_steps, prepared_experiments
-from orthaug.data.record import (
-    Channel,
-    Experiment,
-    Record,
-    as_channels,
-    check_step,
-    same_step,
-    steps_between,
-    unbroken,
-)
+from orthaug.data.record import Experiment, Record, check_step, same_step, steps_between, unbroken
 from orthaug.data.steps import Resample, Run
 from orthaug.data.tables import Table, check_readable, has_column, read_table
 from orthaug.data.variables import ENDINGS

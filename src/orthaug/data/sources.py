@@ -13,7 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from orthaug.data.record import Channel, Experiment, Record, unbroken
+from orthaug.data.channels import Channel
+from orthaug.data.record import Experiment, Record, unbroken
 
 WITNESS_ROWS = 50_000
 """Rows kept in memory for tests of residuals, findings and figures."""

@@ -14,7 +14,7 @@ from orthaug._base.errors import InputError, SurplusCellsError, show
 from orthaug._base.lines import join_words
 from orthaug.data.clock import DATES, Clock, RefusedColumn, by_single_number, find_clock
 from orthaug.data.columns import Column, channel_name
-from orthaug.data.headers import split_header, with_unit
+from orthaug.data.headers import header_with_unit, split_header
 from orthaug.data.layouts import STATES, numbers_only
 from orthaug.data.tables import read_table, read_titles, reading_note
 from orthaug.data.variables import ENDINGS
@@ -206,7 +206,7 @@ def survey(path: Path) -> Survey:
     except InputError as error:  # one of them cannot be read: each by itself
         refused = error
     for header in headers:
-        base, unit = split_header(with_unit(header, units.get(header, "")))
+        base, unit = split_header(header_with_unit(header, units.get(header, "")))
         try:
             values = table[header] if table else read_table(path, [header]).columns[header]
             unusable = "" if np.isfinite(values).any() else "no numbers"

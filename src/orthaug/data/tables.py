@@ -26,7 +26,7 @@ from orthaug._base.errors import (
 from orthaug._base.memory import check_memory
 from orthaug._base.plugins import READERS, discover
 from orthaug._base.progress import LOG
-from orthaug.data.headers import in_seconds, parse_dates, with_unit
+from orthaug.data.headers import header_with_unit, in_seconds, parse_dates
 from orthaug.data.layouts import (
     Layout,
     as_number,
@@ -92,7 +92,7 @@ def read_table(
         table = reader(path, columns, time, **part)
     if time is None or table.dated:
         return table
-    seconds = in_seconds(table.columns[time], with_unit(time, table.units.get(time, "")))
+    seconds = in_seconds(table.columns[time], header_with_unit(time, table.units.get(time, "")))
     return replace(table, columns={**table.columns, time: seconds})
 
 
@@ -107,15 +107,6 @@ def has_column(path: Path, name: str) -> bool:
     except MissingColumnError:
         return False
     return True
-
-
-def column_names(path: Path) -> list[str]:
-    """Return the columns (or variables) of a file that could be read, in order.
-
-    Raises:
-        InputError: no such file, an unknown ending, content that does not fit it.
-    """
-    return read_titles(path).names
 
 
 class Titles(NamedTuple):

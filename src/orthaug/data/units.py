@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import Warning
-from orthaug.data.headers import split_header, with_unit
-from orthaug.data.record import Channel
+from orthaug.data.channels import Channel
+from orthaug.data.headers import header_with_unit, split_header
 from orthaug.data.tables import read_titles
 
 # What engineers write, as the library of units reads it
@@ -79,7 +79,7 @@ def unit_warnings(path: Path, channels: dict[str, Channel]) -> list[Warning]:
     titles = read_titles(path)
     found = []
     for header in titles.names:
-        base, unit = split_header(with_unit(header, titles.units.get(header, "")))
+        base, unit = split_header(header_with_unit(header, titles.units.get(header, "")))
         channel = channels.get(header) or channels.get(base)
         if channel is None or not unit or not channel.unit or _plain(unit) == _plain(channel.unit):
             continue

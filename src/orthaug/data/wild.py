@@ -152,7 +152,7 @@ def threshold_for(record: Record, samples: tuple[WildSample, ...]) -> float:
 
 @dataclass(frozen=True)
 class Marked:
-    """What a threshold of the step `outliers` marks: some of given rows, and `others`."""
+    """Numbers of rows that a threshold of `outliers` marks: some of given ones, and `others`."""
 
     threshold: float
     rows: int

@@ -19,12 +19,13 @@ from orthaug._base.checks import Vector, check_type, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.folders import check_replaceable, whole_folder
 from orthaug._base.jax import Array, jax
-from orthaug.export import written_back
 from orthaug.export.kinds import TARGETS, VECTORS, Target
 from orthaug.export.lowering import program_of
 from orthaug.export.program import WRITTEN, Program, Signal, Vectors
 from orthaug.models import storage
 from orthaug.models.model import HoldsModel, Model, model_of
+from orthaug.physics.source_kinds import SOURCES
+from orthaug.physics.sources import FileSource
 
 _LONGEST = 40  # characters of a name, which is put in front of others
 _TAKEN = (
@@ -55,9 +56,9 @@ def check_target(to: str) -> str:
     Raises:
         InputError: none of that name; the nearest is named.
     """
-    if isinstance(to, str) and to not in TARGETS and to not in written_back.targets():
+    if isinstance(to, str) and to not in TARGETS and to not in source_targets():
         TARGETS.discover()
-    known = (*TARGETS, *written_back.targets())
+    known = (*TARGETS, *source_targets())
     if not isinstance(to, str) or to not in known:
         hint = nearest(to, known) if isinstance(to, str) else ""
         raise InputError(f"no export to {show(to)}{hint}; known are {', '.join(known)}.")
@@ -122,7 +123,7 @@ def export(
     folder = Path(folder)
     check_export(to, folder, name, force=force)
     if to not in TARGETS:
-        written_back.write_back(model, folder, to, force=force)
+        write_back(model, folder, to, force=force)
         return None
     target: Target = TARGETS[to]()
     digest, in_loop = storage.digest(model), model.plant is not model
@@ -270,3 +271,30 @@ def _range(model: Model, program: Program) -> tuple[Vector, Vector]:
         ):
             middle[names.index(name)], reach[names.index(name)] = float(centre), float(width)
     return middle, reach
+
+
+def source_targets() -> tuple[str, ...]:
+    """Return the targets of all sources that can write estimates back."""
+    found = (getattr(source, "target", "") for source in SOURCES.values())
+    return tuple(target for target in found if target)
+
+
+def write_back(model: Model, folder: Path, to: str, *, force: bool = False) -> None:
+    """Write the estimates into a folder, as the program takes them whose file has the physics.
+
+    What a learner adds is not among them.
+
+    Raises:
+        InputError: a model whose physics are not of the kind that the target is for.
+    """
+    motion: Any = getattr(model.form, "motion", None)
+    source: Any = getattr(motion, "source", None)
+    if motion is None or not isinstance(source, FileSource) or source.target != to:
+        own = f"; its own is {source.target}" if isinstance(source, FileSource) else ""
+        raise InputError(f"the physics do not come from a file that {to} writes{own}.")
+    values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
+    units = {parameter.name: parameter.unit for parameter in motion.parameters}
+    files = source.write_back(dict(zip(motion.names, values, strict=True)), units)
+    with whole_folder(folder, force=force) as partial:
+        for name, content in files.items():
+            (partial / name).write_text(content, encoding="utf-8")

@@ -11,9 +11,10 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
+from orthaug._base.lines import with_unit
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
-from orthaug.data.record import Channel
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.beyond import FADED
@@ -220,7 +221,7 @@ def _weighted_terms(
         value = (term.initial or 0.0) if term.fixed else effective[term.parameter]
         unit = term.unit or units.get(term.parameter, "")
         what = "known" if term.fixed else "theta" if held is not None else "theta - theta_aux"
-        named = f"{term.parameter}{f' [{unit}]' if unit else ''}"
+        named = with_unit(term.parameter, unit)
         factor = constants.node("p", term.parameter, value, f"{named}, {what}")
         row = form.outputs.index(term.output) if term.output is not None else 0
         sums[row].append(apply("mul", factor, written(expression)))

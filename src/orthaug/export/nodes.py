@@ -19,6 +19,7 @@ import numpy as np
 
 from orthaug.data.expressions import Expression, Lag
 
+_WIDTH = 110  # columns of exported code
 _BINARY = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.Div: "div"}
 ARITHMETIC: dict[str, Callable[..., float]] = {
     "neg": lambda a: -a,
@@ -269,12 +270,12 @@ def decimal(value: float) -> str:
     return repr(float(value))
 
 
-def wrap_items(items: list[str], indent: str, width: int = 110) -> str:
+def wrap_items(items: list[str], indent: str) -> str:
     """Return items with commas, in lines."""
     lines, line = [], ""
     for item in items:
         piece = f"{item}, "
-        if line and len(indent) + len(line) + len(piece) > width:
+        if line and len(indent) + len(line) + len(piece) > _WIDTH:
             lines.append(indent + line.rstrip())
             line = ""
         line += piece

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from orthaug._base.lines import with_unit
 from orthaug.export.nodes import Node, functions_in
 
 
@@ -26,7 +27,7 @@ class Signal:
     @property
     def label(self) -> str:
         """`name [unit]`."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
+        return with_unit(self.name, self.unit)
 
 
 @dataclass(frozen=True)

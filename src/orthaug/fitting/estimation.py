@@ -133,7 +133,7 @@ def estimate(
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
             Structure, criterion and solver may be names as in a spec, such as "orthogonal",
-            "simulation" and "adam-lbfgs", which stand for their defaults.
+            "simulation" and "adam-lbfgs", each with its defaults.
         criterion: `Prediction(horizon)`, 1 step by default, or `Simulation(segment, washout)`, the
             free run: then θ is trained with the weights, and at the end the fitted function is
             split. A motion takes the latter, by default without washout.

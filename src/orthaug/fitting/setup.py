@@ -76,7 +76,7 @@ class TrainingSetup:
         options.pop("engine", None)  # a fold is small: its rows are in memory
         problem = self.problem.physics_alone() if physics_only else self.problem
         return partial(
-            _fit_fold, pose=problem.poser, train=self.train, options=quick_options(options)
+            fit_fold, pose=problem.poser, train=self.train, options=quick_options(options)
         )
 
     def _options(self, **changes: object) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def quick_options(options: Mapping[str, Any]) -> dict[str, object]:
     }
 
 
-def _fit_fold(
+def fit_fold(
     fold: Record,
     pose: Callable[[Record], object],
     train: Callable[..., object],

@@ -20,8 +20,9 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, nearest
 from orthaug._base.errors import InputError
 from orthaug._base.registry import LIBRARY_ONLY, Option
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import Lag
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Layout, lag_matrix, largest_lag, stack_rows
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.excitation import Excitation, excitation

@@ -18,12 +18,12 @@ from orthaug._base.checks import Matrix, Vector, check_count
 from orthaug._base.errors import InputError, show
 from orthaug._base.jax import Array
 from orthaug._base.views import NotebookView
-from orthaug.data.record import Channel, Experiment, Preparation, Record
+from orthaug.data.channels import Channel
+from orthaug.data.record import Experiment, Preparation, Record
 from orthaug.models.dynamics import Numbers, Parts, Run
 from orthaug.models.kalman import Filter
 from orthaug.models.learners import Scaling
 from orthaug.models.on_records import RUNAWAY, Form, RecordModel, trajectory
-from orthaug.models.open_loop import plant_of
 from orthaug.models.response import Response, Trajectory
 from orthaug.models.starts import PastOutputs, Starts
 from orthaug.models.statistics import Statistics
@@ -398,3 +398,37 @@ def model_of(given: Model[Any] | HoldsModel) -> Model[Any]:
             f"`model` must be a fitted model, or what estimate returns; got {show(given)}."
         )
     return model
+
+
+def plant_of(model: Model[Any]) -> Model[Any]:
+    """Return the model without the controller, its inputs given from outside.
+
+    It has no statistics: those of the fit are the loop's.
+    """
+    loop, plant, numbers = model.form.motion, model.form.motion.plant, model.numbers
+    names = [channel.name for channel in model.outputs]
+    outputs = [names.index(output.name) for output in plant.outputs]
+    states = [loop.names_of_states.index(name) for name in plant.names_of_states]
+    inputs = [len(loop.states) + loop.inputs.index(name) for name in plant.inputs]
+    own = [loop.names.index(name) for name in plant.names]
+    known = {channel.name: channel for channel in (*model.inputs, *model.outputs)}
+    pull = None if numbers.pull is None else np.asarray(numbers.pull)[[*states, *inputs]]
+    own_starts: Any = model.starts
+    starts = replace(own_starts, loose=np.asarray(own_starts.loose)[states])
+    return replace(
+        model,
+        form=replace(model.form, motion=plant),
+        numbers=numbers._replace(
+            theta=np.asarray(numbers.theta)[own],
+            theta_aux=np.asarray(numbers.theta_aux)[own],
+            pull=pull,
+        ),
+        outputs=tuple(model.outputs[i] for i in outputs),
+        inputs=tuple(known.get(name, Channel(name)) for name in plant.inputs),
+        largest_output=np.asarray(model.largest_output)[outputs],
+        deviation=np.asarray(model.deviation)[outputs],
+        weight=np.asarray(model.weight)[np.ix_(outputs, outputs)],
+        statistics=Statistics(),
+        starts=starts,
+        trained=None,
+    )

@@ -11,8 +11,9 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, show
 from orthaug._base.lines import plural
+from orthaug.data.channels import Channel
 from orthaug.data.preparation import steps_again
-from orthaug.data.record import Channel, Experiment, Preparation, Record, same_step
+from orthaug.data.record import Experiment, Preparation, Record, same_step
 from orthaug.models.dynamics import Dynamics, Numbers, Parts
 from orthaug.models.learners import Scaling
 from orthaug.models.response import Trajectory

@@ -13,7 +13,8 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, instants_of
+from orthaug.data.channels import Channel
+from orthaug.data.record import instants_of
 
 if TYPE_CHECKING:
     import pandas as pd

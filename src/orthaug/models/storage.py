@@ -20,8 +20,9 @@ from orthaug._base.errors import InputError, MissingFileError, show
 from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
 from orthaug._base.registry import freeze
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag, parse_named
-from orthaug.data.record import Channel, Preparation
+from orthaug.data.record import Preparation
 from orthaug.data.regressors import Features
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
@@ -38,9 +39,10 @@ from orthaug.physics.closed_loop import close_loop, controller_of
 from orthaug.physics.consent import CONSENTS
 from orthaug.physics.controller import Controller
 from orthaug.physics.innovations import InnovationsModel
-from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.motion import Motion
 from orthaug.physics.noise import NoiseModel
 from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.states import Output, State
 
 FORMAT = 2
 _DECLARATION, _ARRAYS = "model.json", "arrays.safetensors"

@@ -202,12 +202,12 @@ def chunks_of(pieces: Iterable[RowArrays], size: int) -> Iterator[Chunk]:
         yield Chunk(*parts)
 
 
-def read_ahead(items: Iterable[Result], ahead: int = _AHEAD) -> Iterator[Result]:
+def read_ahead(items: Iterable[Result]) -> Iterator[Result]:
     """Yield the items in order, made by a thread of their own while the caller works.
 
     Its errors are raised here.
     """
-    ready: queue.Queue[tuple[bool, Any]] = queue.Queue(ahead)
+    ready: queue.Queue[tuple[bool, Any]] = queue.Queue(_AHEAD)
     given_up = threading.Event()
 
     def put(item: tuple[bool, Any]) -> bool:

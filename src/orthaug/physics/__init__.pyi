@@ -4,7 +4,7 @@ from .baseline import Term as Term
 from .controller import Controller as Controller
 from .excitation import identifiability as identifiability
 from .motion import Motion as Motion
-from .motion import Output as Output
-from .motion import State as State
 from .parameters import PhysicalParameter as PhysicalParameter
 from .parameters import PhysicsMap as PhysicsMap
+from .states import Output as Output
+from .states import State as State

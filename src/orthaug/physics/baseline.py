@@ -14,6 +14,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, check_label, check_type, check_unique, is_number
 from orthaug._base.errors import LONGEST, InputError, show
 from orthaug._base.views import NotebookView
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import (
     RESERVED,
     SAMPLING_TIME,
@@ -23,7 +24,7 @@ from orthaug.data.expressions import (
     is_name,
     parse,
 )
-from orthaug.data.record import Channel, same_step
+from orthaug.data.record import same_step
 from orthaug.data.regressors import Features, Lags, Layout, in_order
 from orthaug.data.writing import coefficient_unit
 

@@ -22,7 +22,8 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import ArrayModule
 from orthaug.data.expressions import SAMPLING_TIME, Expression, parse_named
 from orthaug.physics.controller import Controller
-from orthaug.physics.motion import Motion, Output
+from orthaug.physics.motion import Motion
+from orthaug.physics.states import Output
 
 _AT_REST = "0"  # the equation of a controller's state between samples
 

@@ -17,8 +17,8 @@ from typing import Any
 from orthaug._base.checks import check_unique, is_number
 from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import FUNCTIONS, is_name
-from orthaug.physics.motion import State
 from orthaug.physics.parameters import PhysicalParameter, check_parameters
+from orthaug.physics.states import State
 
 _ERROR, _STATE = "controller_error", "controller_{}"
 _INTEGRAL, _FILTERED = "controller_integral", "controller_filtered"

@@ -22,7 +22,8 @@ import numpy as np
 from orthaug._base.checks import Vector, is_number
 from orthaug._base.errors import InputError, show
 from orthaug.data.record import Record
-from orthaug.physics.motion import Motion, State
+from orthaug.physics.motion import Motion
+from orthaug.physics.states import State
 
 MOST_STATES = 8
 _SHORTEST = 5.0  # samples: a shorter lag is hardly one

@@ -114,12 +114,6 @@ class NoiseModel:
         """Return e of errors v of one stretch; zero on the rows that are past only."""
         return RowFilter(self, (len(errors),)).rows(errors)
 
-    def forecast(self, errors: Float[np.ndarray, "T ny"]) -> Float[np.ndarray, "T ny"]:
-        """Return what the errors before each row say about v there; zero where too few are."""
-        found = errors - self.innovations(errors)
-        found[: self.past] = 0.0
-        return found
-
     def forecast_ahead(
         self, errors: Float[np.ndarray, "T ny"], horizon: int
     ) -> Float[np.ndarray, "m h ny"]:

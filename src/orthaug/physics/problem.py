@@ -575,7 +575,8 @@ def pose_motion(
         motion.check_paced(record)
     motion, learner_inputs = add_memory(motion, learner_inputs, memory, record)
     check_output_weights(output_weights, len(outputs))
-    for name, *samples in zip(outputs, *(one.measured for one in _each(record)), strict=True):
+    parts = [replace(record, experiments=(experiment,)) for experiment in record.experiments]
+    for name, *samples in zip(outputs, *(part.measured for part in parts), strict=True):
         if not any(map(len, samples)):
             raise InputError(f"channel '{name}' has no measured sample; leave it out.")
         if all(np.ptp(own) == 0.0 for own in samples if len(own)):
@@ -595,10 +596,6 @@ def pose_motion(
     problem = replace(problem, motion=replace(motion, integrator=problem.integrator))
     check_start(problem)
     return problem
-
-
-def _each(record: Record) -> list[Record]:
-    return [replace(record, experiments=(experiment,)) for experiment in record.experiments]
 
 
 def _features(motion: Motion, texts: Sequence[str] | None) -> tuple[Expression, ...]:

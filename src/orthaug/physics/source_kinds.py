@@ -12,8 +12,8 @@ from orthaug._base.registry import Registry
 from orthaug.physics.consent import CONSENTS
 from orthaug.physics.fmu import FMU
 from orthaug.physics.mechanisms import MuJoCo
-from orthaug.physics.motion import Origin
 from orthaug.physics.sources import FileSource, PhysicsSource
+from orthaug.physics.states import Origin
 
 SOURCES = Registry(
     "source", {"fmu": FMU, "mujoco": MuJoCo}, group=plugins.SOURCES, follows=PhysicsSource

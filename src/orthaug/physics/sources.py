@@ -23,8 +23,9 @@ from orthaug._base.checks import check_type, is_number, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.registry import LIBRARY_ONLY
 from orthaug.data.record import Record
-from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.states import Output, State
 
 _SHOWN = 12  # names in a message
 _OF_PARAMETER = {"initial": float, "min": float, "max": float, "unit": str}

@@ -17,8 +17,9 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug._base.registry import OneOf, Registry, check_fields
 from orthaug.data.record import Record
-from orthaug.physics.motion import Motion, Output, State
+from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.states import Output, State
 
 _LARGEST_POLE = 0.98  # of a first guess: what least squares place beyond is moved there
 _LEAST_GAIN = 0.05  # of the largest coefficient of B

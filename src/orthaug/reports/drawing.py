@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import wraps
 from pathlib import Path
@@ -214,3 +214,8 @@ def save(figure: Figure, path: Path, kind: str = "png") -> None:
             )  # `savefig` would draw it twice
         else:
             figure.savefig(path, format=kind)
+
+
+def floats(values: Sequence[float | None]) -> np.ndarray:
+    """Return the numbers of a result, NaN for None."""
+    return np.array(values, dtype=float)

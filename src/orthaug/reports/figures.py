@@ -12,7 +12,7 @@ import numpy as np
 
 from orthaug._base.checks import check_choice, check_type
 from orthaug._base.errors import InputError
-from orthaug._base.lines import estimate_cells
+from orthaug._base.lines import estimate_cells, with_unit
 from orthaug.analysis.linear_view import Linearization
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
@@ -328,7 +328,7 @@ class FitPlots:
             axis.set_ylim(*curve_limits(curve, i, part.values[:, i]))
         unit = part.units[part.features.index(feature)]
         axis.set(
-            xlabel=f"{feature} [{unit}]" if unit else feature,
+            xlabel=with_unit(feature, unit),
             ylabel=f"learned part of {part.names[i]}",
         )
         axis.legend(fontsize="small", frameon=False)
@@ -410,7 +410,7 @@ class FitPlots:
         if not phase:
             axis.set_yscale("log")
         unit = gain_unit(view, i, j)
-        what = "phase [°]" if phase else f"gain [{unit}]" if unit else "gain"
+        what = "phase [°]" if phase else with_unit("gain", unit)
         axis.set(
             xlabel="frequency [Hz]",
             ylabel=what,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from orthaug._base.lines import cut, percent
+from orthaug._base.lines import cut, percent, with_unit
 from orthaug.analysis.findings import SuspectResult
 from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.reports.biases import bias_map
@@ -23,12 +23,13 @@ from orthaug.reports.drawing import (
     TOP,
     Axes,
     Figure,
+    floats,
     grid,
     headline,
     label,
     plain,
 )
-from orthaug.reports.page_blocks import regressor_label, with_unit
+from orthaug.reports.page_blocks import regressor_label
 from orthaug.reports.recovery import RecoverResult, relative_errors
 
 _UPRIGHT = 11  # letters of a name that fit above one cell
@@ -52,14 +53,14 @@ def residual_analysis_figure(
     for (own, crossed, over), test in zip(axes, tests, strict=True):
         own.set_title(f"residual of {test.name}", fontsize=9, loc="left", fontweight="bold")
         if test.acf is not None and test.acf_band is not None:
-            own.bar(np.arange(1, len(test.acf)), _floats(test.acf[1:]), color=BLUE, width=0.6)
+            own.bar(np.arange(1, len(test.acf)), floats(test.acf[1:]), color=BLUE, width=0.6)
             own.axhspan(-test.acf_band, test.acf_band, color=GREY, alpha=0.5)
         label(own, x="lag [samples]", y="autocorrelation")
         _correlations(crossed, test)
         label(crossed, x="lag behind the input [samples]", y="correlation with the inputs")
         for name, curve in test.strongest.items():
             centres, means, errors = (
-                _floats(values) for values in (curve.centres, curve.means, curve.errors)
+                floats(values) for values in (curve.centres, curve.means, curve.errors)
             )
             over.errorbar(centres, means, 2.576 * errors, fmt="o", color=GREEN, markersize=3)
             over.axhline(0.0, color=BLACK, linewidth=0.6)
@@ -82,7 +83,7 @@ def _correlations(axis: Axes, test: ResidualTestResult) -> None:
         reach = len(cross.values) // 2
         axis.plot(
             np.arange(-reach, reach + 1),
-            _floats(cross.values),
+            floats(cross.values),
             ".-",
             color=color,
             linewidth=0.8,
@@ -131,11 +132,6 @@ def bias_figure(suspects: Sequence[SuspectResult]) -> Figure:
     axis.spines[:].set_visible(False)
     headline(figure, title)
     return figure
-
-
-def _floats(values: Sequence[object]) -> np.ndarray:
-    """Return the numbers of a result, NaN for None."""
-    return np.array(values, dtype=float)
 
 
 @plain

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.lines import with_unit
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.motion_field import labels_of, parts_at
-from orthaug.reports.page_blocks import with_unit
 
 if TYPE_CHECKING:
     from orthaug.models.model import Model

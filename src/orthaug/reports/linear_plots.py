@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
+from orthaug._base.lines import with_unit
 from orthaug.analysis.linear_view import COHERENT, Linearization, LinearView
 from orthaug.reports.drawing import (
     BLACK,
@@ -50,7 +51,7 @@ def bode_figure(found: Linearization) -> Figure:
         upper.set_yscale("log")
         unit = gain_unit(first, i, j)
         _draw_pair(found, views, upper, lower, (i, j))
-        label(upper, y=f"gain [{unit}]" if unit else "gain")
+        label(upper, y=with_unit("gain", unit))
         label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)
         if ny * nu > 1:
             upper.set_title(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base import lines
-from orthaug._base.lines import MOST_DIGITS, digits_for
+from orthaug._base.lines import MOST_DIGITS, digits_for, with_unit
 from orthaug.analysis.fit_findings import ParameterResult
 
 _LARGE = 7  # digits before the point from which a power of ten is written
@@ -95,11 +95,6 @@ def prose(text: str) -> str:
         'moves y[k-1] by −0.015, from −2 to 3'
     """
     return _MINUS.sub("−", text)
-
-
-def with_unit(name: str, unit: str | None) -> str:
-    """Return a name with its unit in brackets."""
-    return f"{name} [{unit}]" if unit else name
 
 
 def regressor_label(name: str, units: Mapping[str, str]) -> str:

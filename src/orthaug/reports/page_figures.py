@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from orthaug._base.lines import BIASED_INTERVAL
+from orthaug._base.lines import BIASED_INTERVAL, with_unit
 from orthaug.analysis.findings import SuspectResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores, RestartResult
 from orthaug.analysis.residual_tests import RegressorResult, ResidualTestResult
@@ -22,7 +22,6 @@ from orthaug.reports.page_blocks import (
     percent,
     regressor_label,
     round_values,
-    with_unit,
 )
 from orthaug.reports.result import RowResult
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from orthaug._base.lines import with_unit
 from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.reports.biases import REMOVED_BY
-from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent, with_unit
+from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
 from orthaug.reports.result import FitResult
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.lines import BIASED_INTERVAL, digits_for
+from orthaug._base.lines import BIASED_INTERVAL, digits_for, with_unit
 from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.findings import MotionFitResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
@@ -26,7 +26,6 @@ from orthaug.reports.page_blocks import (
     interval,
     number,
     percent,
-    with_unit,
 )
 from orthaug.reports.page_figures import interval_plot, score_plot
 from orthaug.reports.page_findings import (

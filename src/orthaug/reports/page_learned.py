@@ -6,17 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from orthaug._base.lines import with_unit
 from orthaug.reports.learned_part import Curve, LearnedPart, curve_limits, spread_indices
-from orthaug.reports.page_blocks import (
-    Grid,
-    Plot,
-    Text,
-    area,
-    axis_titles,
-    percent,
-    round_values,
-    with_unit,
-)
+from orthaug.reports.page_blocks import Grid, Plot, Text, area, axis_titles, percent, round_values
 
 _MOST_CURVES = 12
 _CLOUD = 600  # points of a cloud

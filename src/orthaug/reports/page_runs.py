@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.data.record import Channel, without_gaps
+from orthaug.data.channels import Channel
+from orthaug.data.record import without_gaps
 from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Plot, area, number, percent
 

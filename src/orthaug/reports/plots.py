@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orthaug._base.lines import with_unit
 from orthaug.data.record import Record, instants_of
 from orthaug.models.model import Model
 from orthaug.models.motion_field import parts_at
@@ -23,6 +24,7 @@ from orthaug.reports.drawing import (
     TOP,
     Figure,
     extent,
+    floats,
     grid,
     headline,
     label,
@@ -35,7 +37,7 @@ from orthaug.reports.drawing import (
     window,
 )
 from orthaug.reports.learned_part import LearnedPart, curve_limits, labels_with_units, trajectory_of
-from orthaug.reports.page_blocks import parameter_label, with_unit
+from orthaug.reports.page_blocks import parameter_label
 from orthaug.reports.result import RowResult
 from orthaug.reports.selection import SelectResult
 
@@ -369,13 +371,8 @@ def _mean_nrmse(row: RowResult, kind: str) -> float:
     return (
         float("nan")
         if nrmse is None or None in nrmse
-        else float(np.sqrt(np.mean(np.square(_floats(nrmse)))))
+        else float(np.sqrt(np.mean(np.square(floats(nrmse)))))
     )
-
-
-def _floats(values: Sequence[float | None]) -> np.ndarray:
-    """Return the numbers of a result, NaN for None."""
-    return np.array(values, dtype=float)
 
 
 def _stack_panels(count: int, title: str) -> tuple[Figure, list]:

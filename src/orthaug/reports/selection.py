@@ -12,7 +12,7 @@ from orthaug.reports.result import DataResult, ResultHeader
 from orthaug.selection.orders import Delay, Orders
 
 if TYPE_CHECKING:
-    from orthaug.data.record import Channel
+    from orthaug.data.channels import Channel
 
 _SHOWN = 12  # models of a stage in the text
 _CHOOSE_LAGS = ', which kind = "terms" in [learner] chooses from'

@@ -37,7 +37,7 @@ from orthaug.reports.result import (
 
 if TYPE_CHECKING:
     from orthaug.analysis.validation import Verdict
-    from orthaug.data.record import Channel
+    from orthaug.data.channels import Channel
     from orthaug.fitting.estimates import Estimate
     from orthaug.models.response import Response, Scores
 

@@ -536,7 +536,7 @@ def settle_terms(space: Space, chosen: list[Candidate]) -> tuple[list[Candidate]
 
 
 _TWINS = {"saturation": "dead_zone", "dead_zone": "saturation"}
-"""Kinds whose terms of one width add up to their variable, so that either stands for the other."""
+"""Kinds whose terms of one width add up to their variable, so that either can replace the other."""
 
 
 def nearest_twins(space: Space, chosen: list[Candidate], fit: Fit) -> tuple[list[Candidate], Fit]:

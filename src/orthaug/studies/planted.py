@@ -17,8 +17,9 @@ from orthaug._base.checks import Matrix, Vector, free_name
 from orthaug.analysis.catalogue import Catalogue
 from orthaug.analysis.imitation import Alternative, imitation, imitation_before
 from orthaug.analysis.suspects import MotionSuspect, Suspect, median_size
+from orthaug.data.channels import Channel
 from orthaug.data.expressions import SAMPLING_TIME
-from orthaug.data.record import Channel, Experiment, Record
+from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import Features, lag_matrix
 from orthaug.inference.splitting import learned_places, slopes_at
 from orthaug.models.dynamics import Numbers

@@ -13,7 +13,7 @@ from typing import Any
 
 from orthaug._base.checks import nearest
 from orthaug._base.errors import InputError
-from orthaug.data.record import Channel
+from orthaug.data.channels import Channel
 from orthaug.reports.benchmark import (
     BenchmarkModelResult,
     ErrorResult,

@@ -11,7 +11,8 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug.data.record import Channel, Record
+from orthaug.data.channels import Channel
+from orthaug.data.record import Record
 from orthaug.physics.baseline import Baseline, Term
 
 NOISE_30_DB = 0.009  # standard deviation of the static example's noise

@@ -98,7 +98,7 @@ THEORY: tuple[Statement, ...] = (
     Statement(
         "cond:stable_sys",
         "The data-generating system forgets its initial state exponentially.",
-        "Of the fitted model: analysis.contraction.contraction, "
+        "Of the fitted model: analysis.free_run_stability.contraction, "
         "analysis.boundedness.find_divergence, analysis.feedback.feedback",
         "tests/test_free_run_stability.py. The true system is not at hand: out of a program's "
         "scope",

@@ -35,7 +35,7 @@ class KeptResult:
 
     @property
     def name(self) -> str:
-        """What the page calls it."""
+        """Its name on the page."""
         return f"result {self.number}"
 
 

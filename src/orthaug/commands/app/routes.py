@@ -22,6 +22,7 @@ from orthaug._base.memory import in_words
 from orthaug._base.progress import LOG
 from orthaug.commands.app.gate import PLAIN
 from orthaug.commands.app.session import Session, Sessions
+from orthaug.commands.app.uploads import begin_file, keep_file
 from orthaug.commands.app.view_data import DataView
 from orthaug.commands.app.view_model import ModelView
 from orthaug.commands.app.view_results import ExportView, ReportView
@@ -243,14 +244,14 @@ async def _keep_upload(sessions: Sessions, key: str, name: str, request: Request
     if declared.isdecimal() and int(declared) > LARGEST:
         return _refuse(_TOO_LARGE.format(in_words(LARGEST)), 413)
     try:
-        partial, size = session.begin_file(name), 0
+        partial, size = begin_file(session.folder, name), 0
         with partial.open("wb") as file:
             async for piece in request.stream():
                 size += len(piece)
                 if size > LARGEST:
                     return _refuse(_TOO_LARGE.format(in_words(LARGEST)), 413)
                 file.write(piece)
-        place, note = session.keep_file(partial, name)
+        place, note = keep_file(partial, name)
     except InputError as error:
         return _refuse(str(error), 422)
     except ClientDisconnect:

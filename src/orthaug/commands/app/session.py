@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from orthaug._base.errors import InputError
-from orthaug._base.folders import file_digest
 from orthaug._base.progress import LOG
 from orthaug.commands.app.kept_results import KeptResult, keep_result, kept_results
 from orthaug.commands.app.processes import Command, WorkerPool
@@ -39,7 +38,7 @@ from orthaug.commands.app.spec_text import (
     with_physics,
     with_value,
 )
-from orthaug.data.tables import KNOWN
+from orthaug.commands.app.uploads import as_name
 
 _SESSIONS = 50  # that are kept at once
 _PAUSE = 0.6  # s without a change until a spec is checked
@@ -160,49 +159,6 @@ class Session:
         return ""
 
     # Data
-
-    def place_for(self, name: str) -> Path:
-        """Return the path under which an uploaded file of that name is kept.
-
-        Raises:
-            InputError: an ending of no data file.
-        """
-        plain_name = _as_name(re.split(r"[/\\]", name)[-1])
-        ending = Path(plain_name).suffix.lower()
-        if ending not in KNOWN or not Path(plain_name).stem:
-            raise InputError(
-                f"'{plain_name}': unknown type of data file; expected one of {', '.join(KNOWN)}."
-            )
-        return self.folder / plain_name
-
-    def begin_file(self, name: str) -> Path:
-        """Return the path of a partial file for an upload of that name.
-
-        `keep_file` moves it to its place.
-
-        Raises:
-            InputError: an ending of no data file.
-        """
-        self.place_for(name)
-        return self.folder / f"{secrets.token_hex(8)}.partial"
-
-    def keep_file(self, partial: Path, name: str) -> tuple[Path, str]:
-        """Move an uploaded file to its place; return that place and a message for the page.
-
-        No file is replaced: other content under the same name gets a number.
-        """
-        first = self.place_for(name)
-        place, number, digest = first, 1, file_digest(partial)
-        while place.exists() and file_digest(place) != digest:
-            number += 1
-            place = first.with_name(f"{first.stem}-{number}{first.suffix}")
-        os.replace(partial, place)
-        return (
-            place,
-            f"another file called {first.name} is here, so this one is {place.name}"
-            if number > 1
-            else "",
-        )
 
     def open_file(self, path: Path) -> None:
         """Look at a data file; begin a spec for it where its columns show their roles."""
@@ -360,7 +316,7 @@ class Session:
         self._check_soon()
 
     def _keep_spec(self) -> None:
-        self.kept_as = self.kept_as or kept_name(_as_name(self.title) or "spec", self.key)
+        self.kept_as = self.kept_as or kept_name(as_name(self.title) or "spec", self.key)
         keep(self.kept_as, self.spec)
 
     def edit(self, author: str, change: Callable[..., str], *given: Any) -> None:
@@ -639,11 +595,6 @@ class Sessions:
         await asyncio.gather(
             self.desk.close(), *(session.close() for session in self._open.values())
         )
-
-
-def _as_name(text: str) -> str:
-    """Return a name that any system accepts as the name of a file."""
-    return re.sub(r"[^\w. -]", "_", text).strip(" .")[-60:]
 
 
 def _zip_folder(folder: Path, place: Path) -> Path:

@@ -12,6 +12,7 @@ from typing import Any
 from nicegui import ui
 
 from orthaug._base.errors import InputError
+from orthaug._base.lines import with_unit
 from orthaug.commands.app import spec_text
 from orthaug.commands.app.session import Session
 from orthaug.commands.app.widgets import (
@@ -376,7 +377,7 @@ class DataView:
             drawn = []
             if name in raw:
                 x = raw[name]["x"]
-                if raw[name].get("untimed"):  # its sampling time stands in the spec alone
+                if raw[name].get("untimed"):  # only the spec has its sampling time
                     x = [step * count for count in x]
                 drawn = [{**raw[name], "x": x, "name": "as measured", "raw": bool(prepared)}]
             unit = ""
@@ -386,7 +387,7 @@ class DataView:
                     drawn.append({**curve, "name": message})
                     unit, name = curve["unit"], channel
             if drawn:
-                rows.append((f"{name} [{unit}]" if unit else name, drawn))
+                rows.append((with_unit(name, unit), drawn))
         other = f"; {session.data.name} is not among them" if session.apart and session.data else ""
         state = (
             rows,

@@ -167,7 +167,7 @@ _COLORS = ("#3b82d0", "#d9730d", "#159a7c", "#9a5fd6", "#c2498a", "#8a7a12")
 
 
 def curves_figure(
-    rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]], unit: str = "time in s"
+    rows: Sequence[tuple[str, Sequence[Mapping[str, Any]]]],
 ) -> dict[str, object]:
     """Return a figure of curves below one another on a common time axis.
 
@@ -178,7 +178,7 @@ def curves_figure(
     named = set[str]()
     layout = _layout(70 + 130 * len(rows))
     layout["xaxis"] |= {
-        "title": _compact_layout(unit),
+        "title": _compact_layout("time in s"),
         "anchor": f"y{len(rows)}" if len(rows) > 1 else "y",
     }
     gap = 0.12 / max(len(rows), 1)

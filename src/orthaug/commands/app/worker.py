@@ -25,8 +25,9 @@ from orthaug.commands.app.spec_text import with_value
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.job_result import check as check_job
 from orthaug.commands.opening import open_job
+from orthaug.data.channels import Channel
 from orthaug.data.columns import Column
-from orthaug.data.record import Channel, check_step
+from orthaug.data.record import check_step
 from orthaug.data.survey import Survey
 
 if TYPE_CHECKING:
@@ -299,7 +300,7 @@ def _stretch(part: str, ran: Mapping[str, Response]) -> list[dict[str, object]]:
     known |= {name: response.trajectories[worst].model for name, response in ran.items()}
     return [
         {
-            "label": f"{channel.name} [{channel.unit}]" if channel.unit else channel.name,
+            "label": channel.label,
             "part": part,
             "curves": [
                 {"name": name, "x": _plain(time), "y": _plain(values[own, j])}
