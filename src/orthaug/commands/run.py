@@ -14,9 +14,9 @@ import numpy as np
 from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError, MissingSampleError, Warning
 from orthaug._base.folders import file_digest, whole_file
-from orthaug._base.lines import percent
+from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import results_beside
-from orthaug.commands.parts import long_stretches
+from orthaug.commands.parts import gaps_text, long_stretches
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
 from orthaug.data.record import Channel, Record
@@ -232,6 +232,21 @@ def open_run(
         notes += (f"note: {data}: {text}",)
     begin = 0 if reading.rows is None else int(np.ravel(reading.rows)[0])
     return ModelOnData(loaded, record, data, rows, notes, first_row=begin)
+
+
+def missing_notes(model: Model, data: Path, record: Record) -> tuple[str, ...]:
+    """Return a note on the rows of a file that are left out, or lack outputs; none without any."""
+    first, notes = model.form.first_row, ()
+    if record.missing:
+        long = [one for one in record.experiments if len(one) > first]
+        notes += (f"note: {data}: {gaps_text(record, long, first)}",)
+    if not record.complete:
+        lost = sum(int(np.isnan(one.outputs).any(axis=1).sum()) for one in record.experiments)
+        notes += (
+            f"note: {data}: {plural(lost, 'row')} lack outputs; what the data alone show is of "
+            "the others.",
+        )
+    return notes
 
 
 def record_for(
