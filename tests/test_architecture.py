@@ -58,6 +58,7 @@ ENTRIES = {
 }
 CONCEPTS = {
     "_base.kept_programs": "traced programs on disk",
+    "analysis.amplitude_dependence": "the nearest linear system over movements of some size",
     "models.controller_states": "what a controller has read until a row",
     "data.units": "units, read by a library",
     "selection.linear_runs": "linear models by the error of their free run",

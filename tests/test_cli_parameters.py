@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from pathlib import Path
@@ -961,3 +962,19 @@ def test_a_split_says_where_the_fit_has_larger_standard_errors(tmp_path, monkeyp
     split = finite_json(run("split", "out", "run.csv", "--json").out)
     assert all(row["std"] is None and row["ci95"] is None for row in split["parameters"])
     assert "the fit gave none" in split["warnings"][0]["text"]
+
+
+def test_the_times_of_some_rows_are_those_of_the_file(inside, tmp_path):
+    """Also behind a row that is missing, and where every second row is read."""
+    columns = pd.read_csv("run.csv")
+    columns.loc[50, "y"] = np.nan
+    columns.to_csv(tmp_path / "hole.csv", index=False)
+    whole = pd.read_csv(io.StringIO(run("simulate", "out", "run.csv").out))
+    part = pd.read_csv(io.StringIO(run("simulate", "out", "run.csv", "--rows", "40:90").out))
+    np.testing.assert_allclose(part["time"], whole["time"][40:90])
+    hole = run("simulate", "out", tmp_path / "hole.csv", "--rows", "40:90", "--missing", "skip")
+    np.testing.assert_allclose(pd.read_csv(io.StringIO(hole.out))["time"], whole["time"][40:90])
+    second = run("predict", "out", "run.csv", "--rows", "40:90", "--every", 2)
+    step = whole["time"][1]  # what the model knows is the time between the rows that are read
+    found = pd.read_csv(io.StringIO(second.out))["time"]
+    np.testing.assert_allclose(found, 20 * step + step * np.arange(25))

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, write_csv
 
+import orthaug as oa
+from orthaug.analysis.scoring import equal_within_noise
 from orthaug.reports.result import CompareResult
 from orthaug.reports.text import _parameter_cells
 
@@ -75,6 +79,34 @@ def test_with_a_validation_part_the_lowest_error_there_is_marked(project):
         r["name"]: r["scores"]["validation"]["prediction"]["rmse"][0] for r in result["comparison"]
     }
     assert result["chosen"] == min(errors, key=errors.__getitem__)
+    assert run("fit", project, "--out", "fit").code == 0
+    done = run("compare", project, "--out", "again", "--force", "--model", "fit")
+    (equal,) = re.findall("equal to (.*) within noise: (.*)\n", done.out)
+    assert equal[0] == result["chosen"] and "fit" in equal[1].split(", ")
+    assert "physics alone" not in equal[1]
+    words = " ".join(done.out.split())
+    assert "equal to it within noise" in words[words.index("Take “") :]
+
+
+def test_errors_that_differ_by_chance_are_equal_within_noise():
+    """Two models of one system, fitted to other rows; a third with another parameter."""
+    rng = np.random.default_rng(2)
+    u, y = rng.normal(size=3000), np.zeros(3000)
+    for k in range(1, 3000):
+        y[k] = 0.8 * y[k - 1] + u[k - 1]
+    y += 0.3 * rng.normal(size=3000)
+    pieces = [oa.Record.from_arrays(u[i : i + 1000], y[i : i + 1000]) for i in (0, 1000, 2000)]
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+    ahead = oa.Simulation()
+    one, other = (
+        oa.estimate(piece, physics, learner=None, criterion=ahead).model for piece in pieces[:2]
+    )
+    worse = oa.estimate(pieces[0], physics, learner=None).model  # noise in lags moves θ
+    runs = [model.simulate(pieces[2]) for model in (one, other, worse)]
+    errors = [run.scores().nrmse[0] for run in runs]
+    assert errors[0] != errors[1] and errors[2] > 1.01 * errors[0]
+    assert equal_within_noise(runs[0], runs[1], [0])
+    assert not equal_within_noise(runs[0], runs[2], [0])
 
 
 def test_without_a_learner_there_is_only_the_physics(project):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
@@ -720,3 +721,42 @@ def test_inputs_of_a_motion_that_are_misread_are_named(read, code, said):
     assert {"reversed_input", "exchanged_inputs"} & texts.keys() == ({code} if code else set())
     if code == "reversed_input":
         assert "Most likely an input is misread: heat may have the other" in found.residuals.text
+
+
+def clipped(record: oa.Record, channel: str, limit: float) -> oa.Record:
+    """The record with one channel clipped to ±limit, as by a sensor whose range ends there."""
+    u, y = record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0]
+    u, y = (np.clip(x, -limit, limit) if n == channel else x for n, x in (("u", u), ("y", y)))
+    return Record.from_arrays(u, y, sampling_time=record.sampling_time)
+
+
+def test_samples_at_a_limit_come_before_missing_terms():
+    record = second_order(0, equation=0.001)
+    assert "at a limit" not in of(record).text
+    (where,) = re.findall(
+        r"First look at samples at a limit: (.*) of the rows, and the model goes beyond",
+        (found := of(clipped(record, "y", 4.0))).text,
+    )
+    assert re.fullmatch(r"y is -4 on [\d.]+ % and 4 on [\d.]+ %", where)
+    assert found.text.index("at a limit") < found.text.index("The predictable share")
+    read = of(clipped(record, "u", 1.5)).text
+    assert "the rows in which u is -1.5 and 1.5, and the next 3, have" in read
+
+
+def test_samples_at_a_limit_come_before_the_missing_terms_of_a_motion():
+    u = np.repeat(np.random.default_rng(2).uniform(0, 6, (60, 2)), 16, axis=0) * [1, 0]
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "b*u - k*x", "y")],
+        [oa.Output("y", "x")],
+        [oa.PhysicalParameter("b", 0.1, min=0), oa.PhysicalParameter("k", 0.1, min=0)],
+        ["u"],
+    )
+    texts = {}
+    for top in (np.inf, 10.0):
+        y = np.minimum(heated(u), top)
+        record = Record.from_arrays(u[:, 0], y, sampling_time=1.0)
+        texts[top] = of(record, motion).text
+    assert "at a limit" not in texts[np.inf]
+    assert "First look at samples at a limit: y is 10 on" in texts[10.0]
+    limit, term = texts[10.0].index("at a limit"), texts[10.0].index(" Otherwise ")
+    assert "most likely" in texts[10.0][term:] and limit < term

@@ -187,8 +187,32 @@ def test_of_a_level_a_root_is_tried_and_no_friction_and_of_a_velocity_the_revers
                 term.expression == "sign(y[k-1])*sqrt(abs(y[k-1]))"
                 and term.coefficient == pytest.approx(-0.1)
             )
-    assert kinds[0.0] ^ kinds[-1.0] == {"square_root", "coulomb", "stribeck", "stribeck_gauss"}
+    friction = {"coulomb", "tanh", "atan", "stribeck", "stribeck_gauss"}
+    assert kinds[0.0] ^ kinds[-1.0] == {"square_root", *friction}
     assert "square_root" in kinds[0.0] and "coulomb" in kinds[-1.0]
+
+
+@pytest.mark.parametrize("bend", ["tanh", "arctan"])
+def test_smooth_friction_is_named_with_its_width(bend):
+    rng = np.random.default_rng(4)
+    u, y = rng.normal(size=ROWS), np.zeros(ROWS)
+
+    def plant(x):
+        bent = getattr(np, bend)((x[:, 0] - x[:, 1]) / 0.3)
+        return (x @ [1.5, -0.6, 0.5] - 0.2 * bent)[:, None]
+
+    for k in range(2, ROWS):
+        y[k] = plant(np.array([[y[k - 1], y[k - 2], u[k - 1]]]))[0, 0]
+    terms = (("a", "y[k-1]"), ("b", "y[k-2]"), ("g", "u[k-1]"))
+    baseline = oa.Baseline.from_terms([oa.Term(name, lag) for name, lag in terms])
+    record = oa.Record.from_arrays(u, y, outputs=[oa.Channel("y", "rad")])
+    fit = oa.orthogonalize(record, baseline, plant)
+    (term,) = oa.explain(fit).terms
+    name = bend.replace("arc", "a")
+    assert (term.kind, term.parameter, term.unit) == (name, "friction", "rad")
+    assert term.expression == f"{name}(((y[k-1] - y[k-2])/Ts)/{term.width})"
+    assert term.width == pytest.approx(0.3, rel=1e-3)
+    assert term.coefficient == pytest.approx(-0.2, rel=1e-3)
 
 
 def friction(rows: int = 2000) -> oa.Record:
@@ -267,6 +291,10 @@ def test_what_python_is_given(hardening):
         oa.explain(model, record, functions=["asb"])
     with pytest.raises(InputError, match="candidate terms; at most 3000 are looked at"):
         oa.explain(model, record, degree=30)
+    with pytest.MonkeyPatch.context() as patch:  # before the learner is evaluated
+        patch.setattr("orthaug.selection.explanation.linearization_of", None)
+        with pytest.raises(InputError, match="to the degree 100 make .* at most 3000"):
+            oa.explain(model, record, degree=100)
 
 
 @pytest.mark.parametrize("half", [0.0, 0.005])

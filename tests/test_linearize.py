@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -408,6 +409,66 @@ def test_dry_friction_at_rest_is_no_line():
     model = estimate(oa.Record.from_arrays(u, y), baseline, learner=None).model
     assert [warning.code for warning in oa.linearize(model, "u = 0, y = 0")[0].warnings] == ["kink"]
     assert not oa.linearize(model, "y = 2")[0].warnings
+
+
+def test_steep_friction_depends_on_the_amplitude_and_is_said_with_figures():
+    rng = np.random.default_rng(0)
+    force, speed = rng.normal(size=600), np.zeros(600)
+    for k in range(1, 600):
+        speed[k] = 0.9 * speed[k - 1] - 0.02 * np.tanh(speed[k - 1] / 0.05) + force[k - 1]
+    terms = (("a", "y[k-1]"), ("f", "tanh(y[k-1]/0.05)"), ("b", "u[k-1]"))
+    physics = oa.Baseline.from_terms([oa.Term(name, text) for name, text in terms])
+    record = oa.Record.from_arrays(force, speed + 1e-3 * rng.normal(size=600), sampling_time=STEP)
+    model = estimate(record, physics, learner=None).model
+    (warning,) = oa.linearize(model, "u = 0, y = 0")[0].warnings
+    assert warning.code == "amplitude_dependent"
+    a, f, _ = model.theta
+    slope = {"rest": a + f / 0.05, "data": a + f * np.sqrt(2 / np.pi) / speed.std()}
+    poles = {where: np.log(value) / STEP for where, value in slope.items()}
+    found = re.search(
+        "it has a real pole at ([^ ]+) 1/s, at the operating point a real pole at ([^ ]+) 1/s",
+        warning.text,
+    )
+    assert float(found[1]) == pytest.approx(poles["data"], rel=0.02)
+    assert float(found[2]) == pytest.approx(poles["rest"], rel=0.02)
+    assert not oa.linearize(model, "y = 2")[0].warnings
+
+
+def test_the_damping_of_a_motion_with_steep_friction_is_that_of_small_movements_only():
+    def motion(friction: str) -> oa.Motion:
+        return oa.Motion.from_equations(
+            states=[
+                oa.State("x", "v", start="y"),
+                oa.State("v", f"u - c*v - 60*x - {friction}", start=0.0),
+            ],
+            outputs=[oa.Output("y", "x")],
+            inputs=["u"],
+            parameters=[oa.PhysicalParameter("c", 1.1), oa.PhysicalParameter("F", 0.3)],
+            integrator="rk4",
+            substeps=4,
+        )
+
+    force, x = np.repeat(np.random.default_rng(0).normal(0, 4, 40), 10), np.zeros(2)
+    moved = np.zeros(len(force))
+    for k, u in enumerate(force):
+        moved[k] = x[0]
+        for _ in range(4):
+            x = _runge_kutta(
+                lambda x, u=u: np.array(
+                    [x[1], u - 1.1 * x[1] - 60 * x[0] - 0.3 * np.tanh(x[1] / 0.02)]
+                ),
+                x,
+                STEP / 4,
+            )
+    record = oa.Record.from_arrays(force, moved, sampling_time=STEP)
+    model = estimate(record, motion("F*tanh(v/0.02)"), learner=None).model
+    (warning,) = oa.linearize(model, "u = 0")[0].warnings
+    speed = np.sqrt(60) * moved.std()
+    damping = (1.1 + 0.3 * np.sqrt(2 / np.pi) / speed) / (2 * np.sqrt(60))
+    found = re.search("it has damping ([^ ]+) at 1.23 Hz", warning.text)
+    assert float(found[1]) == pytest.approx(damping, rel=0.05)
+    mild = estimate(record, motion("F*tanh(v/50)"), learner=None).model
+    assert not oa.linearize(mild, "u = 0")[0].warnings
 
 
 def test_without_a_joint_covariance_the_learner_is_frozen_or_nothing_is_told(linear, cubic):

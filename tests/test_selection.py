@@ -18,6 +18,8 @@ from orthaug.reports.selection import SelectResult, selection_text
 from orthaug.selection.candidates import SHORTLIST, candidates
 from orthaug.selection.forward import Equations, forward
 from orthaug.selection.nonlinearity import nonlinearity
+from orthaug.selection.term_path import PathModel, judge_all
+from orthaug.selection.term_runs import Point
 
 PHYSICS = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
 LAGS, FLOWN = oa.Lags(2, 2, 1), oa.Simulation(128, 20)
@@ -372,6 +374,31 @@ def test_an_input_that_acts_by_its_square_stays_a_candidate(seed):
     assert set(one.learner.terms) == {"u[k-1]**2", "y[k-1]"}
     assert one.delays[0].correlation is None and one.delays[0].square == 1
     assert one.delays[0].fitted is None and one.lags.nb[0] > 0
+
+
+def test_an_input_that_the_physics_reads_may_act_by_the_square_of_another_lag():
+    """The linear lag of the physics does not keep the test from the input's other lags."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=600)
+    y = scipy.signal.lfilter([0, 0, 0.4], [1, -0.8], u**2) + 0.02 * rng.normal(size=600)
+    record, learner = oa.Record.from_arrays(u=u, y=y), oa.Terms(degree=2)
+    one = oa.select(record, PHYSICS, learner=learner, criterion=FLOWN, most=3)
+    assert one.nonlinearity.found and one.nonlinearity.matter == ("u[k-2]",)
+    texts = {warning.code: warning.text for warning in one.notes}
+    if not one.terms.chosen.size:  # picked without a block, the terms are others
+        assert "Picked on all rows, u[k-2]**2 would lower it" in texts["nothing_helps"]
+    else:
+        assert "u[k-2]**2" in one.learner.terms
+
+
+def test_what_is_far_worse_on_every_block_is_not_as_good():
+    """The blocks of a model that drifts differ by more than the mean of its squares."""
+    point, held = Point((), np.zeros(1), np.zeros(1)), np.array([0.6, 0.57, 9.6, 1.3, 0.6])
+    alone = PathModel(point, (), held, 0.0, 0)
+    better = PathModel(point, (), 0.001 * held[::-1], 0.0, 1)
+    assert [one.within for one in judge_all([alone, better])] == [False, True]
+    near = PathModel(point, (), np.where(held > 9, 0.6, held + 0.1), 0.0, 1)
+    assert judge_all([alone, near])[0].within
 
 
 def test_lags_of_the_chosen_orders_reach_the_terms():

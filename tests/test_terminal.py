@@ -15,7 +15,15 @@ import pytest
 from test_cli import SPEC, make_project, run
 from typer.main import get_command
 
-from orthaug._base.lines import WIDTH, estimate_cells, fit_screen, fold, table
+from orthaug._base.lines import (
+    WIDTH,
+    continued,
+    estimate_cells,
+    fit_screen,
+    fold,
+    narrow_screen,
+    table,
+)
 from orthaug._base.progress import LOG, show_log
 from orthaug.commands import bars, program, streams
 from orthaug.inference.kinds import MEASURES
@@ -143,6 +151,16 @@ def test_tables_leave_columns_out_by_rank():
         "stiffness    1.5  N/m",
     ]
     assert table(rows, 17, drop=["initial", "unit"])[0] == "name       value"
+
+
+def test_long_products_go_on_in_a_row_below():
+    rows = [["", "error", "s", "model"], ["→", "0.5", "1.0", "+ speed[k-1]*level[k-2]**2"]]
+    with narrow_screen(30):
+        assert table(continued(rows, drop=["s"])) == [
+            "   error  model",
+            "→    0.5  + speed[k-1]*",
+            "          level[k-2]**2",
+        ]
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,30 @@ def test_rows_with_missing_samples_count(project, tmp_path):
     assert 200 <= result["alarms"][0]["row"] < 230
     rows = pd.read_csv(tmp_path / "out" / "table.csv")["row"]
     assert not set(rows) & set(np.flatnonzero(missing)) and {49, 299} <= set(rows)
+    lost = (
+        "holes.csv: 84 rows have missing cells and are left out with all windows that touch them; "
+        "212 usable rows remain, in 2 stretches."
+    )
+    assert lost in " ".join(done.err.split())
+    for command in (("split", folder / "fit"), ("linearize", folder / "fit", "--data")):
+        assert lost in " ".join(run(*command, tmp_path / "holes.csv").err.split())
+
+
+def test_rows_missing_at_the_end_of_a_file_count_before_the_next_one(project, tmp_path):
+    folder, _ = project
+    u, y = signals(300, 8)
+    y[290:] = np.nan
+    write_csv(tmp_path / "ends.csv", u=u, y=y)
+    first = ("--data", tmp_path / "ends.csv", "--training", folder / "run.csv")
+    later = ("--data", folder / "later.csv", "--state", tmp_path / "one", "--follows")
+    for arguments, name in ((first, "one"), (later, "two")):
+        done = run("track", folder / "fit", *arguments, "--out", tmp_path / name, "--json")
+        assert done.code == 0, done.err
+    assert finite_json((tmp_path / "one" / "result.json").read_text())["rows"] == 300
+    assert finite_json(done.out)["rows"] == 600
+    # Nothing reads across the missing rows: the first lags of the next file are history only
+    rows = set(pd.read_csv(tmp_path / "two" / "table.csv")["row"])
+    assert not rows & {*range(290, 302)} and {289, 302} <= rows
 
 
 REFUSED = [

@@ -19,6 +19,7 @@ _LATEST = 64  # column at which the last cell of a row may begin for it to be fo
 INTERVAL_HEAD = "95 % interval"  # of the column of intervals
 BIASED_INTERVAL = "95 % interval with the bias"  # of one that covers noise and bias
 _GAP = "  "
+_FACTOR = re.compile(r"(?<=[^*]\*)(?=[^*])")  # behind the sign of a product, not of a power
 _NUMBER = re.compile(r"(?:[-+−<]? ?[\d.]+(?:e[-+]?\d+)?(?: %)?|–|inf|)")  # a cell of figures
 MOST_DIGITS = 15  # of a number in double precision
 _LEAST_DIGITS = 3  # of a value with a standard error
@@ -182,11 +183,7 @@ def table(
         ['part  FIT %', 'test     90']
     """
     count, most = max(len(row) for row in rows), width or _screen[0]
-    whole = [[*row, *[""] * (count - len(row))] for row in rows]
-    for head in drop:
-        if sum(_widths(whole)) + len(_GAP) * (len(whole[0]) - 1) <= most:
-            break
-        whole = [[row[i] for i, name in enumerate(whole[0]) if name != head] for row in whole]
+    whole = _without([[*row, *[""] * (count - len(row))] for row in rows], drop, most)
     widths = _widths(whole)
     right = [
         i > 0 and all(_NUMBER.fullmatch(row[i]) for row in whole[1:]) for i in range(len(widths))
@@ -203,16 +200,34 @@ def table(
     return lines
 
 
-def continued(rows: Sequence[Sequence[str]], indent: int = 0) -> list[list[str]]:
+def _without(
+    rows: Sequence[Sequence[str]], drop: Sequence[str], most: int
+) -> Sequence[Sequence[str]]:
+    """Return rows without the columns of heads `drop`, in that order, until they fit."""
+    for head in drop:
+        if sum(_widths(rows)) + len(_GAP) * (len(rows[0]) - 1) <= most:
+            break
+        rows = [[row[i] for i, name in enumerate(rows[0]) if name != head] for row in rows]
+    return rows
+
+
+def continued(
+    rows: Sequence[Sequence[str]], indent: int = 0, drop: Sequence[str] = ()
+) -> list[list[str]]:
     """Return rows whose table fits the screen: what is too long for a cell goes on in a row below.
 
-    Columns that are narrower than an equal share keep their width, and the others share the rest.
+    Columns of heads `drop` are left out first. Those that are narrower than an equal share keep
+    their width, and the others share the rest. Products are cut behind a factor.
 
     Examples:
         >>> with narrow_screen(20):
         ...     continued([["seen", "determined"], ["u, v", "a, b, c, d, e, f"]])
         [['seen', 'determined'], ['u, v', 'a, b, c, d, e,'], ['', 'f']]
+        >>> with narrow_screen(12):
+        ...     continued([["n", "model"], ["1", "+ speed*level**2"]])
+        [['n', 'model'], ['1', '+ speed*'], ['', 'level**2']]
     """
+    rows = _without(rows, drop, _screen[0] - indent)
     widths = _widths(rows)
     left = _screen[0] - indent - len(_GAP) * (len(widths) - 1)
     share = list(range(len(widths)))
@@ -223,12 +238,23 @@ def continued(rows: Sequence[Sequence[str]], indent: int = 0) -> list[list[str]]
         widths[i] = max(left // len(share), 1)
     whole: list[list[str]] = []
     for row in rows:
-        cells = [
-            textwrap.wrap(cell, most, break_long_words=False, break_on_hyphens=False) or [""]
-            for cell, most in zip(row, widths, strict=True)
-        ]
+        cells = [_cut(cell, most) for cell, most in zip(row, widths, strict=True)]
         whole += [list(parts) for parts in zip_longest(*cells, fillvalue="")]
     return whole
+
+
+def _cut(cell: str, most: int) -> list[str]:
+    """Return the lines of a cell, cut at spaces and behind the factors of long products."""
+    lines = [""]
+    for word in cell.split():
+        pieces = [word] if len(word) <= most else _FACTOR.split(word)
+        for i, piece in enumerate(pieces):
+            gap = " " if lines[-1] and not i else ""
+            if len(lines[-1]) + len(gap) + len(piece) <= most or not lines[-1]:
+                lines[-1] += gap + piece
+            else:
+                lines.append(piece)
+    return lines
 
 
 def _widths(rows: Sequence[Sequence[str]]) -> list[int]:

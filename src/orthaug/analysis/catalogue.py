@@ -60,6 +60,12 @@ class Family(NamedTuple):
     members: tuple[float, ...]
     scaled: bool = True
 
+    def expression(self, on: str, width: str) -> str:
+        """Return the member of a width, or power, that acts on an expression."""
+        if _WHOLE.fullmatch(on):
+            return self.text(on, width)
+        return self.text(f"({on})", width).replace(f"(({on}))", f"({on})")
+
 
 def _odd_power(x: str, power: str) -> str:
     """Return a power with the sign of x; the square as quadratic drag is written."""
@@ -74,6 +80,10 @@ FAMILIES = (
     Family("dead_zone", lambda x, w: f"{x} - max(min({x}, {w}), -{w})", _KINKS),
     Family("saturation", lambda x, w: f"max(min({x}, {w}), -{w})", _KINKS),
 )
+
+
+SMOOTH_FRICTION = {family.name: family for family in FAMILIES if family.name in ("tanh", "atan")}
+"""Families of friction that turns round smoothly."""
 
 
 class Argument(NamedTuple):
@@ -234,13 +244,11 @@ def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
     size = np.abs(values[np.isfinite(values)])
     if not np.any(size > 0):
         return
-    median, whole = float(np.median(size[size > 0])), _WHOLE.fullmatch(on) is not None
-    x = on if whole else f"({on})"
+    median = float(np.median(size[size > 0]))
     for family in FAMILIES:
         for member in family.members:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
-            text = family.text(x, w)
-            text = text if whole else text.replace(f"({x})", x)
+            text = family.expression(on, w)
             named = text.startswith(f"{family.name}(") or not family.scaled  # as tanh(v/0.5) is
             yield text if named else f"{family.name}({on}, {w})", text
 

@@ -13,15 +13,17 @@ is (`missing_terms`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import singledispatch
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
-from orthaug._base.checks import Matrix, check_type
+from orthaug._base.checks import Matrix, check_type, positive
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import percent, plural
+from orthaug._base.lines import join_words, percent, plural
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.exchanged_inputs import exchanged_inputs, misread_inputs
@@ -47,6 +49,8 @@ from orthaug.analysis.verdict_text import (
     free_run_words,
     words,
 )
+from orthaug.data.columns import Column
+from orthaug.data.gaps import SATURATED, saturated_outputs
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.data.steps import Outliers
@@ -85,6 +89,9 @@ _NAMED = 3
 _LEVEL = 0.01  # of the test of missing terms
 # Of the output's deviation: a free run that leaves less has no dead time to look for
 _SIZABLE = 0.02
+# Of the squared error in rows at an input's limit and the next few: this share, and so many times
+# that of the rows
+_AT_LIMITS, _OFTENER, _NEXT = 0.5, 2.0, 3
 _FEWEST_COMPLETE = 30  # rows with all outputs, to test residuals
 _LAGS = 10  # of inputs that may predict the error
 _ROWS_PER_LAG = 20
@@ -211,7 +218,8 @@ def _of_motion(
         late = () if misread else find_late_inputs(task, solver)
     explained = explained or bool(late or misread)
     verdict = "unmodelled" if explained else "white" if white else "equation_noise"
-    lacking = (lacks or several, late, coarse, slight, misread)
+    limits = "" if white else _at_limits(record, free_run, errors, inputs, motion.held)
+    lacking = (lacks or several, late, coarse, slight, misread, limits)
     text = free_run_words(verdict, fit, tests, shares, followed, curved, *lacking)
     warnings = [restarted[1]] if restarted else []
     warnings += [*misread, *(one.warning for one in late)]
@@ -225,6 +233,60 @@ def _of_motion(
         warnings.append(Warning("coloured_residual", colour_sentence(fit) + more))
     found = (verdict, text, (), tests, None, None, tuple(warnings), shares, (), missing)
     return Diagnosis(*found, late=late, steps=coarse.steps if coarse else None)
+
+
+def _at_limits(
+    record: Record,
+    response: Response,
+    errors: list[Matrix],
+    inputs: list[Matrix],
+    limited: Sequence[str] = (),
+) -> str:
+    """Return sentences on samples at a limit, which look like missing terms; "" without any.
+
+    Those of outputs count where the model goes beyond, those of inputs where most of the squared
+    error is in the rows at the limit.
+
+    Args:
+        record: of the training.
+        response: its outputs by the model.
+        errors: of the model (N, ny) by experiment.
+        inputs: likewise.
+        limited: names of outputs whose limits are known.
+    """
+    whole = record.complete and len(response.model) == len(record)
+    ended = saturated_outputs(record, response.model, limited) if whole else []
+    if ended:
+        rows = join_words([f"{one.output} is {one.rows} of the rows" for one in ended])
+        return (
+            f"First look at samples at a limit: {rows}, and the model goes beyond. A sensor that "
+            "ends there leaves errors that look like missing terms. Mark these samples as missing "
+            '(step = "limits" of data.prepare) and fit again before you add a term.'
+        )
+    scale = positive(np.concatenate(errors).std(axis=0))
+    for j, channel in enumerate(record.inputs):
+        own = [piece[:, j] for piece in inputs]
+        column = Column(channel.name, channel.name, channel.unit, np.concatenate(own))
+        ends = [value for value, rows in column.limits if rows >= SATURATED * len(column.values)]
+        near = [_after(np.isin(piece, ends)) for piece in own]
+        squares = [np.sum((piece / scale) ** 2, axis=1) for piece in errors]
+        share = sum(float(s[n].sum()) for s, n in zip(squares, near, strict=True)) / sum(
+            float(s.sum()) for s in squares
+        )
+        if ends and share > max(_AT_LIMITS, _OFTENER * float(np.concatenate(near).mean())):
+            values = join_words([f"{end:.6g} {channel.unit}".strip() for end in ends])
+            return (
+                f"First look at samples at a limit: the rows in which {channel.name} is {values}, "
+                f"and the next {_NEXT}, have {percent(share)} of the error's mean square. If its "
+                "sensor ends there, the true input was larger. Leave these stretches out and fit "
+                "again before you add a term."
+            )
+    return ""
+
+
+def _after(there: Bool[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    """Return the rows that are there, and the next few."""
+    return np.convolve(there, np.ones(1 + _NEXT))[: len(there)] > 0
 
 
 def _physics_alone(fit: MotionEstimate) -> tuple[MotionTask, LevenbergMarquardt]:
@@ -344,6 +406,11 @@ def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
         seen = replace(
             seen, changes=tuple(change for change in seen.changes if change.kind != "learner")
         )
+    if verdict != "white" and not seen.steps:
+        minimised = free_run if seen.own is not seen.tests and free_run else seen.one_step
+        firsts = [run.start for run in minimised.trajectories]
+        inputs = [e.inputs[first:] for e, first in zip(record.experiments, firsts, strict=True)]
+        seen = replace(seen, limits=_at_limits(record, minimised, errors_of(minimised), inputs))
     text, warnings = words(verdict, seen)
     described = seen.fit.model.coloured or (white and complete)
     drift = () if described or free_run is None else find_drift(free_run, "auto")

@@ -272,6 +272,40 @@ def one_sided(
 
 
 @partial(quick_jit, static_argnames=("step", "field"))
+def remainder_at(
+    step: Step,
+    field: bool,
+    numbers: Numbers,
+    rest: Array,
+    inputs: Array,
+    moves: Array,
+    shifts: Array,
+) -> Float[Array, "m n"]:
+    """Return what the slopes at a point of rest leave of the next state, or of the derivatives.
+
+    Args:
+        step: the step.
+        field: whether the equations in time are meant.
+        numbers: of the model.
+        rest: the point.
+        inputs: at the point.
+        moves: of the state from there, (m, n).
+        shifts: of the inputs, (m, nu).
+    """
+    both, point = _of_point(step, field, numbers), _build_rows(step, field, rest, inputs)
+    ends, n = 1 if field else step.ends, len(step.states)
+    apart = jnp.concatenate([moves, *([shifts] * ends)], axis=1)
+    middle, slope = both(point), jax.jacfwd(both)(point)
+    return (jax.vmap(lambda d: both(point + d) - middle - slope @ d)(apart))[:, :n]
+
+
+def state_sizes(step: Step, size: Vector) -> Vector:
+    """Return the sizes of a step's state from those of its rest, 1 for past inputs."""
+    ones = np.ones(len(step.inputs))
+    return positive(np.abs(np.asarray(step.state_at(jnp.asarray(size), jnp.asarray(ones)))))
+
+
+@partial(quick_jit, static_argnames=("step", "field"))
 def slope_at(
     step: Step, field: bool, numbers: Numbers, rest: Array, inputs: Array, width: Array
 ) -> Float[Array, "m n"]:

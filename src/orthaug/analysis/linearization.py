@@ -11,6 +11,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import percent
+from orthaug.analysis.amplitude_dependence import amplitude_warnings
 from orthaug.analysis.linear_steps import (
     difference_widths,
     one_sided,
@@ -89,9 +90,10 @@ def linearize(
         record = model.fitting(record, need_outputs=False)
     frequency = _frequencies(frequencies, model.sampling_time)
     step, given = step_of(model), parse_point(at)
-    held = np.zeros(len(model.inputs))
+    held = moving = np.zeros(len(model.inputs))
     if record is not None and record.inputs:
-        held = np.concatenate([experiment.inputs for experiment in record.experiments]).mean(axis=0)
+        inputs = np.concatenate([experiment.inputs for experiment in record.experiments])
+        held, moving = inputs.mean(axis=0), inputs.std(axis=0)
     outputs = [channel.name for channel in model.outputs]
     search = Search.of(step, model, outputs, given, held)
     points, warnings = operating_points(search)
@@ -103,7 +105,9 @@ def linearize(
             "lines between samples, the frequency response that of the equations."
         )
         warnings.append(Warning("hold_replaced", text))
-    views = tuple(_view(model, search, point, spread, frequency, continuous) for point in points)
+    views = tuple(
+        _view(model, search, point, spread, frequency, continuous, moving) for point in points
+    )
     measured = None if record is None else measured_response(record)
     return Linearization(views, measured, _held_clause(search, given, record), tuple(warnings))
 
@@ -186,6 +190,7 @@ def _view(
     spread: _Spread | None,
     frequency: Vector | None,
     method: str,
+    moving: Vector,
 ) -> LinearView:
     sampled = _system(search, point, spread, model.sampling_time)
     warnings, step = _kinks(search, point, sampled), search.step
@@ -205,6 +210,8 @@ def _view(
     else:
         found = convert_to_continuous(sampled, method, step.memory, names)
     poles = poles_of(sampled, own, freedom)
+    if not warnings or warnings[0].code != "kink":
+        warnings += amplitude_warnings(search, point, sampled, own, poles, model.deviation, moving)
     if any(
         pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1]
         for pole in poles

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from orthaug._base.checks import positive
 from orthaug._base.errors import Warning
 from orthaug.analysis.fit_findings import PartScores, ScoreResult
 from orthaug.analysis.residuals import RunningResidual
 from orthaug.data.part import Part
 from orthaug.data.sources import rows_of
+from orthaug.fitting.colour import correlation_length
 from orthaug.models.long_runs import scores_along
 from orthaug.models.model import Model
 from orthaug.models.response import Response
+
+_MEMORIES = 3  # times as long a block as the differences of squared errors are correlated
+_FEWEST = 8  # blocks for a standard error
+_SURE = 2.0  # standard errors
 
 
 def score_part(
@@ -49,6 +57,47 @@ def score_part(
             )
             warnings.append(Warning("constant_output", text))
     return PartScores.model_validate(scores), responses
+
+
+def equal_within_noise(one: Response, other: Response, skips: Sequence[int]) -> bool:
+    """Return whether the mean squared errors of two responses to one part differ by chance alone.
+
+    The differences of the squares, of all outputs in their deviations, have a standard error from
+    means of blocks that are three times as long as their correlation (batch means). Where it lasts
+    too long for blocks, nothing is known: then the answer is no.
+
+    Args:
+        one, other: responses of two models.
+        skips: leading rows of each experiment that are not scored.
+    """
+    measured = [t.measured for t in one.trajectories if t.measured is not None]
+    if len(measured) < len(one.trajectories) or len(measured) != len(other.trajectories):
+        return False
+    deviation = positive(np.nanstd(np.concatenate(measured), axis=0))
+    apart = []
+    for a, b, y, skip in zip(one.trajectories, other.trajectories, measured, skips, strict=True):
+        first = max(a.start, b.start, skip)
+        squares = [np.nansum(((y - run.model) / deviation)[first:] ** 2, axis=1) for run in (a, b)]
+        apart.append(squares[0] - squares[1])
+    if not all(np.isfinite(own).all() for own in apart) or not any(map(len, apart)):
+        return False
+    longest = max(map(len, apart))
+    stacked = np.array([np.pad(own, (0, longest - len(own))) for own in apart])
+    if not stacked.any():
+        return True
+    length = correlation_length(stacked)
+    if length is None:
+        return False
+    means = [
+        block.mean()
+        for own in apart
+        for block in np.array_split(own, max(len(own) // (_MEMORIES * length), 1))
+        if len(block)
+    ]
+    if len(means) < _FEWEST:
+        return False
+    error = np.std(means, ddof=1) / np.sqrt(len(means))
+    return bool(abs(np.mean(np.concatenate(apart))) <= _SURE * error)
 
 
 def _score_along(model: Model, part: Part, warnings: list[Warning]) -> PartScores:

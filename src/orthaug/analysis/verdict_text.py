@@ -107,6 +107,8 @@ class Finding:
     changes: tuple[Change, ...] = ()
     steps: Mapping[str, float] = field(default_factory=dict)
     """Steps of the outputs whose one-step error has their size."""
+    limits: str = ""
+    """Sentences on samples at a limit; "" without any."""
     inconsistent: Warning | None = None
     """That coloured errors move the one-step θ, by how many standard errors, and what the remedies
     give.
@@ -272,9 +274,8 @@ def _unmodelled_text(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     findings = [*findings[:_LISTED], *(["and more"] if len(findings) > _LISTED else [])]
     opening = f"The {seen.what}, {_size(seen)}, contains more than noise: {'; '.join(findings)}."
     advice = "" if seen.steps and not seen.changes else _advice(seen, _cause(seen))
-    return " ".join(
-        part for part in (opening, _shares(seen), _quantisation_text(seen), advice) if part
-    ), ()
+    parts = (opening, seen.limits, _shares(seen), _quantisation_text(seen), advice)
+    return " ".join(part for part in parts if part), ()
 
 
 def _quantisation_text(seen: Finding) -> str:
@@ -407,6 +408,7 @@ def free_run_words(
     coarse: QuantisedOutput | None = None,
     slight: MissingTest | None = None,
     misread: tuple[Warning, ...] = (),
+    limits: str = "",
 ) -> str:
     """Return the verdict on a motion's free run in words, with its reason.
 
@@ -414,6 +416,7 @@ def free_run_words(
         slight: terms that surely explain a little of it.
         misread: what the record shows of inputs that are read wrongly.
         coarse: the steps of the outputs, where these are most of the error.
+        limits: sentences on samples at a limit, which come first.
     """
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
@@ -431,6 +434,8 @@ def free_run_words(
     if verdict == "white":
         noise = "is white: noise on the outputs, which the training assumes."
         return f"{subject} ({sizes}) {noise}{small_effects(tests, shares)}"
+    before = f"{limits} " if limits else ""
+    more = f"{subject} ({sizes}) contains more than noise"
     if verdict == "equation_noise":
         learner = "that the learner does not see" if fit.learns else "(a learner would show which)"
         inputs = fit.problem.motion.inputs
@@ -452,20 +457,15 @@ def free_run_words(
             )
             cause = "The cause of the rest is"
         return (
-            f"{subject} ({sizes}) is coloured ({colour}). The tests of the residual find "
-            f"{no_term}{cause} {fed}disturbances, or physics missing in an equation "
+            f"{subject} ({sizes}) is coloured ({colour}). {before}The tests of the residual "
+            f"find {no_term}{cause} {fed}disturbances, or physics missing in an equation "
             f"{learner}.{remedy}"
         )
     if misread:
-        return (
-            f"{subject} ({sizes}) contains more than noise. Most likely an input is misread: "
-            f"{misread[0].text}"
-        )
+        return f"{more}. {_after(limits, 'Most likely')} an input is misread: {misread[0].text}"
     if late:
-        return (
-            f"{subject} ({sizes}) contains more than noise. Most likely "
-            f"{late[0].input} acts {late[0].manner}: {late[0].gain}."
-        )
+        acts = f"{late[0].input} acts {late[0].manner}: {late[0].gain}."
+        return f"{more}. {_after(limits, 'Most likely')} {acts}"
     if lacks is not None:
         named = _name_terms(lacks, fit)
         held = fit.problem.motion.held
@@ -474,14 +474,19 @@ def free_run_words(
                 " A wrong constant of the controller may look the same: compare its output with "
                 f"measured {join_words(held)}."
             )
-        return f"{subject} ({sizes}) contains more than noise. {named}"
+        return f"{more}. {_after(limits, named)}"
     what = [f"{name} follows {', '.join(given)}" for name, given in followed.items()]
     what += [f"{name} varies with {', '.join(given)}" for name, given in curved.items()]
     what = what or [f"{100 * max(s.inputs for s in shares):.0f} % follows from the inputs"]
     held = "Physics is missing" + (
         ", or inputs move differently between samples" if fit.problem.motion.inputs else ""
     )
-    return f"{subject} ({sizes}) contains more than noise: {'; '.join(what)}. {held}."
+    return f"{more}: {'; '.join(what)}. {limits or f'{held}.'}"
+
+
+def _after(limits: str, text: str) -> str:
+    """Return a sentence behind those on samples at a limit, if there are any."""
+    return f"{limits} Otherwise {text[:1].lower()}{text[1:]}" if limits else text
 
 
 def small_effects(tests: tuple[ResidualTest, ...], shares: tuple[Predictable, ...]) -> str:

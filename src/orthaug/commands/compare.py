@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from orthaug._base.progress import SILENT, Progress, Stage
 from orthaug.analysis.doubts import doubt
 from orthaug.analysis.examination import cross_validated, judge_fit
 from orthaug.analysis.fit_findings import parameter_rows
-from orthaug.analysis.scoring import score_part
+from orthaug.analysis.scoring import equal_within_noise, score_part
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import FitReport, fit_variant
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, origin_of
@@ -23,7 +23,9 @@ from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
 from orthaug.models import storage
 from orthaug.models.model import Model
+from orthaug.models.response import Response
 from orthaug.reports import plots
+from orthaug.reports.page_verdict import best_row
 from orthaug.reports.result import CompareResult, RowResult
 
 
@@ -71,7 +73,10 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         fitted[kind] = doubt(fit_variant(job, variant, progress.after(runs=number * job.run_count)))
     verdicts = _verdicts(job, fitted)
     rows = [_row(kind, fit, verdicts.get(kind)) for kind, fit in fitted.items()]
-    rows += [_saved_row(name, model, job) for name, model in models.items()]
+    responses = {name: one.responses for name, one in fitted.items()}
+    for name, model in models.items():
+        row, responses[name] = _saved_row(name, model, job)
+        rows.append(row)
     content = {
         "spec": job.declaration,
         "data": job.data,
@@ -80,7 +85,39 @@ def compare(job: Job, saved: Sequence[Path] = (), progress: Progress = SILENT) -
         "left_out": left_out,
         "warnings": job.warnings,
     }
-    return Comparison(job, fitted, verdicts, CompareResult.model_validate(content))
+    which = int(criterion.simulates or not job.validation)
+    chosen_by = {
+        name: {part: both[which] for part, both in (own or {}).items()}
+        for name, own in responses.items()
+    }
+    skips = {part.name: part.skips for part in job.parts}
+    result = with_equal_rows(CompareResult.model_validate(content), chosen_by, skips)
+    return Comparison(job, fitted, verdicts, result)
+
+
+def with_equal_rows(
+    result: CompareResult,
+    responses: Mapping[str, Mapping[str, Response]],
+    skips: Mapping[str, Sequence[int]],
+) -> CompareResult:
+    """Return a comparison that says which rows differ from the best one by chance alone.
+
+    Args:
+        result: the comparison.
+        responses: of every part, by the name of the row: those that the choice is made by.
+        skips: of every part, leading rows of each experiment that are not scored.
+    """
+    best, part = best_row(result)
+    own = responses.get(best, {}).get(part)
+    if own is None:
+        return result
+    others = {name: runs[part] for name, runs in responses.items() if name != best and part in runs}
+    equal = [
+        name
+        for name, other in others.items()
+        if equal_within_noise(own, other, skips.get(part, [0] * len(own.trajectories)))
+    ]
+    return result.model_copy(update={"equal": [best, *equal] if equal else None})
 
 
 def _criterion(job: Job, progress: Progress) -> tuple[Criterion, FitReport | None]:
@@ -175,12 +212,16 @@ def _row(kind: str, fitted: FitReport, verdict: Verdict | None) -> RowResult:
     return row_of(kind, fit.model, result.scores, result.warnings, **own, learner_to_physics=share)
 
 
-def _saved_row(name: str, model: Model, job: Job) -> RowResult:
+def _saved_row(
+    name: str, model: Model, job: Job
+) -> tuple[RowResult, dict[str, tuple[Response, Response]]]:
     warnings: list[Any] = []
-    scores = {part.name: score_part(model, part, warnings)[0] for part in job.parts}
-    return row_of(
+    found = {part.name: score_part(model, part, warnings) for part in job.parts}
+    scores = {part: scores for part, (scores, _) in found.items()}
+    row = row_of(
         name, model, scores, warnings, status="saved", parameters=parameter_rows(*model.estimated)
     )
+    return row, {part: responses for part, (_, responses) in found.items()}
 
 
 def row_of(

@@ -9,7 +9,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder
 from orthaug.commands.folder import check_figure, check_file, save_figure
 from orthaug.commands.parts import load_parts
-from orthaug.commands.run import ReadOptions, open_run
+from orthaug.commands.run import ReadOptions, missing_notes, open_run, prepared_notes
 from orthaug.commands.spec import load_spec
 from orthaug.data.record import Record
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from orthaug.analysis.linear_view import Linearization
     from orthaug.models.model import Model
 
+_PREPARED = "Operating points are those of data after these steps."
 _FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -43,8 +44,8 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
                 raise InputError(f"{out}: holds {file}, which is read; give another folder.")
 
 
-def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None]:
-    """Return the model, and the record of a data file or of the training data of a spec.
+def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None, tuple[str, ...]]:
+    """Return the model, the record of a data file or of the training data of a spec, and notes.
 
     Raises:
         InputError: no model, no file, missing columns.
@@ -52,18 +53,22 @@ def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None]:
     if data is None:
         from orthaug.models.storage import load
 
-        return load(model), None
+        loaded = load(model)
+        return loaded, None, prepared_notes(loaded, what=_PREPARED)
     if data.suffix.lower() != ".toml":
         opened = open_run(model, data, need_outputs=True, reading=ReadOptions("auto", prepare=True))
-        return opened.model, opened.record
+        notes = missing_notes(opened.model, data, opened.record)
+        return opened.model, opened.record, (*prepared_notes(opened.model, what=_PREPARED), *notes)
     from orthaug.models.storage import load
 
     loaded = load(model)
     record = load_parts(data, load_spec(data))[0].record
     try:
-        return loaded, loaded.fitting(record, need_outputs=True)
+        record = loaded.fitting(record, need_outputs=True)
     except InputError as error:
         raise InputError(f"{data}: {error}") from None
+    notes = prepared_notes(loaded, what=_PREPARED)
+    return loaded, record, (*notes, *missing_notes(loaded, data, record))
 
 
 def write(found: Linearization, out: Path, *, force: bool = False) -> None:

@@ -296,14 +296,11 @@ def linearize(
     All with intervals, and the frequency response.
     """
     from orthaug.commands import linearize as linearizing
-    from orthaug.commands.run import prepared_notes
 
     linearizing.check_place(out, model, *([data] if data else []), force=force)
-    opened, record = linearizing.open_linear(model, data)
+    opened, record, notes = linearizing.open_linear(model, data)
     prepare_jax()
-    for line in prepared_notes(
-        opened, what="Operating points are those of data after these steps."
-    ):
+    for line in notes:
         streams.say(line)
     from orthaug.analysis.linearization import linearize as linearized
 
@@ -385,7 +382,7 @@ def track(
     """
     from orthaug.commands import track as tracking
     from orthaug.commands.folder import check_folder, check_kept
-    from orthaug.commands.run import prepared_notes, read_rows
+    from orthaug.commands.run import read_rows
     from orthaug.reports.tracking import track_text
 
     folder = out or Path("orthaug-out/track")
@@ -393,7 +390,7 @@ def track(
     check_kept(folder, *(data or ()), *(training or ()), model)
     opened = tracking.open_track(model, data or (), training or (), read_rows(rows), state)
     prepare_jax()
-    for line in prepared_notes(opened.model, opened.record):
+    for line in opened.notes:
         streams.say(line)
     tracked = tracking.track(
         opened, forgetting=forgetting, memory=memory, state=state, follows=follows

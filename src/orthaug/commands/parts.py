@@ -21,7 +21,7 @@ from orthaug.data.parquet_source import open_parquet
 from orthaug.data.part import Part
 from orthaug.data.preparation import warnings_of
 from orthaug.data.readers import read_record
-from orthaug.data.record import Record, same_step
+from orthaug.data.record import Experiment, Record, same_step
 from orthaug.data.sources import witness
 from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
 from orthaug.data.units import unit_warnings
@@ -119,14 +119,23 @@ def long_stretches(
             f"{record.experiments[0].source}: {what}the longest stretch between missing "
             f"samples has {plural(most, 'row')}, too few: {needed}.{remedy and f' {remedy}.'}"
         )
-    kept = replace(record, experiments=long)
-    usable = sum(len(experiment) - first for experiment in long)
+    return replace(record, experiments=long), gaps_text(record, long, first)
+
+
+def gaps_text(record: Record, kept: Sequence[Experiment], first: int) -> str:
+    """Return a text on the rows that a record lacks, and on those that remain.
+
+    Args:
+        kept: the stretches that are used.
+        first: rows at the beginning of each that are history only.
+    """
+    usable = sum(max(len(experiment) - first, 0) for experiment in kept)
     lost = (
         "row has missing cells and is" if record.missing == 1 else "rows have missing cells and are"
     )
-    return kept, (
+    return (
         f"{record.missing} {lost} left out with all windows that touch them; "
-        f"{plural(usable, 'usable row')} remain, in {len(long)} stretch{'es' * (len(long) > 1)}."
+        f"{plural(usable, 'usable row')} remain, in {len(kept)} stretch{'es' * (len(kept) > 1)}."
     )
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from orthaug._base.checks import check_choice, nearest
 from orthaug._base.errors import InputError, MissingSampleError, Warning
 from orthaug._base.folders import file_digest, whole_file
-from orthaug._base.lines import percent
+from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import results_beside
-from orthaug.commands.parts import long_stretches
+from orthaug.commands.parts import gaps_text, long_stretches
 from orthaug.data.channels import Channel
 from orthaug.data.preparation import MENDING, SAMPLING, steps_again
 from orthaug.data.readers import read_record
@@ -232,7 +232,24 @@ def open_run(
         record, text = long_stretches(record, stretches, first, remedy=keep)
         notes += (f"note: {data}: {text}",)
     begin = 0 if reading.rows is None else int(np.ravel(reading.rows)[0])
+    if begin and record.time_column is None and record.experiment_column is None:
+        record = _later(record, begin * _steps_of(loaded, reading, loaded.outputs)[1])
     return ModelOnData(loaded, record, data, rows, notes, first_row=begin)
+
+
+def missing_notes(model: Model, data: Path, record: Record) -> tuple[str, ...]:
+    """Return a note on the rows of a file that are left out, or lack outputs; none without any."""
+    first, notes = model.form.first_row, ()
+    if record.missing:
+        long = [one for one in record.experiments if len(one) > first]
+        notes += (f"note: {data}: {gaps_text(record, long, first)}",)
+    if not record.complete:
+        lost = sum(int(np.isnan(one.outputs).any(axis=1).sum()) for one in record.experiments)
+        notes += (
+            f"note: {data}: {plural(lost, 'row')} lack outputs; what the data alone show is of "
+            "the others.",
+        )
+    return notes
 
 
 def record_for(
@@ -243,16 +260,15 @@ def record_for(
     Raises:
         InputError: as `read_record`.
     """
-    steps, step, missing = (), model.sampling_time, reading.missing
+    missing = reading.missing
     if missing == "auto":
         missing = "keep" if model.form.takes_gaps and not model.coloured else "skip"
-    if reading.prepare:
-        steps, step = steps_again(model.prepared, [c.name for c in (*model.inputs, *outputs)], step)
+    steps, step = _steps_of(model, reading, outputs)
     return read_record(
         data,
         inputs=model.inputs,
         outputs=outputs,
-        sampling_time=None if model.time_column else step / reading.every,
+        sampling_time=None if model.time_column else step,
         time=model.time_column,
         rows=reading.rows,
         every=reading.every,
@@ -262,6 +278,22 @@ def record_for(
         prepare=steps,
         uneven=model.form.steps_unevenly,
     )
+
+
+def _steps_of(
+    model: Model, reading: ReadOptions, outputs: Sequence[Channel]
+) -> tuple[Sequence[Any], float]:
+    """Return the steps of preparation, and the time from a row of the file to the next in s."""
+    steps, step = (), model.sampling_time
+    if reading.prepare:
+        steps, step = steps_again(model.prepared, [c.name for c in (*model.inputs, *outputs)], step)
+    return steps, step / reading.every
+
+
+def _later(record: Record, time: float) -> Record:
+    """Return the record with its instants so much later: those of the file's own rows."""
+    moved = (replace(one, start_time=one.start_time + time) for one in record.experiments)
+    return replace(record, experiments=tuple(moved))
 
 
 def experiment_column(model: Model, data: Path) -> str | None:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
-from orthaug.commands.compare import choose_row, row_of
+from orthaug.commands.compare import choose_row, row_of, with_equal_rows
 from orthaug.commands.folder import results_beside
 from orthaug.commands.job import surroundings, toml_of
 from orthaug.commands.parts import load_parts
@@ -143,9 +143,8 @@ def compare_results(found: Sequence[SavedResult], arguments: Sequence[str]) -> S
         "settings": _settings(found),
         "warnings": warnings,
     }
-    return SavedComparison(
-        _origin(found, arguments), CompareResult.model_validate(content), responses
-    )
+    result = with_equal_rows(CompareResult.model_validate(content), responses, {})
+    return SavedComparison(_origin(found, arguments), result, responses)
 
 
 def write(comparison: SavedComparison, folder: Path, *, force: bool = False) -> None:

@@ -19,6 +19,7 @@ from orthaug.commands.folder import results_beside
 from orthaug.commands.run import (
     ModelOnData,
     ReadOptions,
+    missing_notes,
     prepared_notes,
     record_for,
     rows_taken,
@@ -61,9 +62,9 @@ def open_training(model: Path, data: Sequence[Path], rows: tuple[int, int] | Non
                 f"{rows[0]}:{rows[1]}."
             )
             warnings.append(Warning("other_training_data", text))
-        read.append(
-            record_for(loaded, path, loaded.outputs, replace(reading, rows=rows or reading.rows))
-        )
+        reading = replace(reading, rows=rows or reading.rows)
+        read.append(record_for(loaded, path, loaded.outputs, reading))
+        notes += missing_notes(loaded, path, read[-1])
     record, (doubts, withheld) = Record.join(read), _standard_errors(model)
     notes = [*prepared_notes(loaded, record), *notes]
     found = (*warnings, *doubts)

@@ -13,7 +13,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
 from orthaug.analysis.fit_findings import parameter_rows, physical_rows
 from orthaug.commands.folder import results_beside
-from orthaug.commands.run import ReadOptions, record_for
+from orthaug.commands.run import ReadOptions, missing_notes, prepared_notes, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable
@@ -34,10 +34,12 @@ class TrackingInput:
     """A model with new data, its training data, and the physical parameters of its result."""
 
     model: Model
-    record: Record
+    records: tuple[Record, ...]
+    """Of each file."""
     training: Record | None
     files: tuple[FileResult, ...]
     physics: PhysicsMap | None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +85,19 @@ def open_track(
         from orthaug.fitting.recursive_rows import MOTION
 
         raise InputError(f"{model}: {MOTION}")
-    records, files = [], []
+    records, files, notes = [], [], []
     for path in data:
         records.append(record_for(loaded, path, loaded.outputs, ReadOptions("skip", prepare=True)))
         files.append(FileResult(file=str(path), sha256=file_digest(path), rows=len(records[-1])))
-    given = open_training(model, training, rows).record if training else None
+        notes += missing_notes(loaded, path, records[-1])
+    given = open_training(model, training, rows) if training else None
+    if given is not None:
+        prepared = prepared_notes(loaded, given.record)
+        notes += [note for note in given.notes if note not in prepared]
+    physics = _physics_of(model, loaded.sampling_time)
+    notes = (*prepared_notes(loaded, Record.join(records)), *notes)
     return TrackingInput(
-        loaded, Record.join(records), given, tuple(files), _physics_of(model, loaded.sampling_time)
+        loaded, tuple(records), given and given.record, tuple(files), physics, notes
     )
 
 
@@ -133,7 +141,8 @@ def track(
         online = Recursive.load(place)
         if digest(online.fitted) != digest(opened.model):
             raise InputError(f"{state}: is the state of another model; give a state of this model.")
-    online.update(opened.record, gap=not follows)
+    for i, record in enumerate(opened.records):
+        online.update(record, gap=i > 0 or not follows)
     return TrackingReport(online, _result(opened, online), opened.physics)
 
 

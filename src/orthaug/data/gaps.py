@@ -17,7 +17,7 @@ from orthaug.data.record import Experiment, Record, unbroken, without_gaps
 
 _REGULAR = 0.8  # of the rows that lie in every n-th
 _SHORTEST = 20  # rows of a stretch
-_SATURATED = 0.01  # of the rows, at an extreme value
+SATURATED = 0.01  # of the rows, at an extreme value
 _AT_LIMIT = 1e-3  # of the output's deviation: a model so close to an extreme value is there
 _SAME_ROWS = 0.5  # of the rows where data or model are at a limit: both are
 
@@ -29,6 +29,8 @@ class Mending:
     warning: Warning
     output: str
     step: dict[str, Any]
+    rows: str = ""
+    """Of samples at a limit: their values and shares of the rows."""
 
 
 def regular_rows(there: Bool[np.ndarray, "N"]) -> slice | None:
@@ -101,7 +103,7 @@ def saturated_outputs(
             continue
         values = record.measured[j]
         limits = Column(output.name, output.name, output.unit, values).limits
-        ends = [(value, rows) for value, rows in limits if rows >= _SATURATED * len(values)]
+        ends = [(value, rows) for value, rows in limits if rows >= SATURATED * len(values)]
         if model is not None:
             ends = [(end, rows) for end, rows in ends if not _has_limit(model[:, j], values, end)]
         if not ends:
@@ -124,7 +126,7 @@ def saturated_outputs(
             "write that into the physics."
         )
         step = {"step": "limits", **step, "channels": [output.name]}
-        found.append(Mending(Warning("saturated_output", text), output.name, step))
+        found.append(Mending(Warning("saturated_output", text), output.name, step, named))
     return found
 
 

@@ -85,8 +85,7 @@ class TermLibrary:
             for name in dict.fromkeys(functions)
             for signal in signals
         ]
-        plain = comb(len(signals) + degree, degree) if degree else 0
-        count = plain + len(made) * (comb(len(signals) + degree - 1, degree - 1) if degree else 0)
+        count = count_products(len(signals), degree, len(set(functions)))
         if count > MOST_TERMS:
             raise InputError(
                 f"{len(signals)} signals to the degree {degree} make {count} terms; at most "
@@ -168,6 +167,14 @@ class TermLibrary:
                 )
             gone.add(there)
         return self.pick(i for i in range(len(self)) if i not in gone) if gone else self
+
+
+def count_products(signals: int, degree: int, functions: int = 0) -> int:
+    """Return the number of products of a library of so many signals and functions."""
+    if not degree:
+        return 0
+    lower = comb(signals + degree - 1, degree - 1)
+    return comb(signals + degree, degree) + functions * signals * lower
 
 
 def products_of(factors: Any, numbers: Any, xp: ArrayModule) -> Any:

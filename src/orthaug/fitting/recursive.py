@@ -217,6 +217,11 @@ class Recursive:
             self.rows += left_out
             alarms += self._follow(used, whitened)
             self.rows += count
+        at_end = 0 if record is None else max(record.missing - sum(lost), 0)
+        if at_end:  # what comes next does not follow on the last row that is there
+            tail = self._lagging.nothing
+            self._watch.gap()
+            self.rows += at_end
         self._tail = tail
         self.alarms = (*self.alarms, *alarms)
         return alarms

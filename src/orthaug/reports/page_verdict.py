@@ -90,7 +90,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
             "Look at the warnings below, and fit again.",
         )
     errors = {row.name: _worst_score(row.scores)[0] or 0.0 for row in rows}
-    best = result.chosen or _best_model(rows, errors)
+    best = best_row(result)[0]
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst_score(row.scores)
     doubts = list(_doubts(row, result.data))
@@ -102,10 +102,13 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         else "bad"
     )
     level = "care" if level == "good" and doubts else level
+    _, *equal = result.equal or [best]
     near = [name for name in errors if name != best and errors[name] <= _ALIKE * (error or 0.0)]
+    near = [name for name in near if name not in equal]
     same = [name for name in near if percent(errors[name]) == percent(errors[best])]
     near = [name for name in near if name not in same]
-    least = all(errors[best] <= other for name, other in errors.items() if name not in same)
+    alike = [*same, *equal]
+    least = all(errors[best] <= other for name, other in errors.items() if name not in alike)
     less = f", as {'does' if len(same) == 1 else 'do'} {_quote_names(same)}" if same else ""
     less += (
         (", and no other model has a smaller error" if same else ", the smallest of all models")
@@ -114,6 +117,7 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     )
     how = f"it has the lowest error on the validation part, and {_error_text(error or 0.0, part)}"
     trust = f"Take “{best}”: {how if result.chosen else _error_text(error or 0.0, part) + less}"
+    trust += f"; {_quote_names(equal)} {_verb_for(equal)} equal to it within noise" if equal else ""
     trust += f"; {_quote_names(near)} {_verb_for(near)} as good within 10 %." if near else "."
     if doubts:
         trust = f"{trust[:-1]}. But {join_words(doubts[:_MOST_DOUBTS])}."
@@ -129,6 +133,18 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
         )
         use += f", and its learner {_word(row)}." if row.validation else "."
     return PageVerdict(level, trust, use, _after_comparison(result, row))
+
+
+def best_row(result: CompareResult) -> tuple[str, str]:
+    """Return the model to take and the part that says so; "" for both where none has a score."""
+    rows = [row for row in result.comparison if _worst_score(row.scores)[0] is not None]
+    if not rows:
+        return "", ""
+    errors = {row.name: _worst_score(row.scores)[0] or 0.0 for row in rows}
+    if result.chosen:
+        return result.chosen, "validation"
+    best = _best_model(rows, errors)
+    return best, _worst_score(next(row for row in rows if row.name == best).scores)[1]
 
 
 def _agreement(result: CompareResult) -> str:

@@ -169,7 +169,7 @@ class CompareResult(ResultHeader):
     Of saved results `spec` is that of the first one, and `data` are the parts that all have.
     """
 
-    absent: ClassVar = frozenset({"differences", "settings"})
+    absent: ClassVar = frozenset({"differences", "settings", "equal"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -179,6 +179,10 @@ class CompareResult(ResultHeader):
     differences: list[DifferenceResult] | None = None
     """Of every parameter that a saved result shares with the first one."""
     settings: list[SettingResult] | None = None
+    equal: list[str] | None = None
+    """Rows whose held-out error differs from that of the best one by chance alone, and the best
+    one first; None where there are none.
+    """
     warnings: list[Warning]
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.content import Content, Flag, Number, Whole
 from orthaug._base.errors import Warning
-from orthaug._base.lines import estimate_cells, fold, plural, table
+from orthaug._base.lines import continued, estimate_cells, fold, plural, table
 from orthaug.inference.chosen_terms import Intervals
 from orthaug.reports.result import DataResult, ResultHeader
 from orthaug.selection.orders import Delay, Orders
@@ -207,7 +207,7 @@ def _figure(value: float | None, std: float | None) -> str:
 def _learner(result: SelectResult) -> str:
     learner = result.learner
     if learner is None:
-        return "none: nothing beside the physics lowers the error on the held-out blocks"
+        return "none: nothing beside the physics surely lowers the error on the held-out blocks"
     if learner["kind"] == "terms":
         return plural(len(learner["terms"]), "term")
     seen = ", ".join(learner.get("inputs") or ["all lags"])
@@ -224,7 +224,7 @@ def _table(stage: str, rows: list[SelectionRowResult]) -> list[str]:
         error = "–" if row.standard_error is None else f"{row.standard_error:.2g}"
         mark = "→" if row.chosen else ""
         cells.append([mark, str(row.size), score, error, f"{row.seconds or 0:.1f}", row.model])
-    lines = table(cells, drop=["s"])
+    lines = table(continued(cells, drop=["s"]))
     if len(rows) > len(shown):
         lines.append(f"{len(shown)} of {len(rows)} models are shown.")
     return lines

@@ -172,6 +172,9 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
     lines += ["", *_score_table(result.comparison, what)]
     if result.chosen:
         lines += ["", "* chosen on the validation part"]
+    if result.equal:
+        best, *others = result.equal
+        lines += [f"equal to {best} within noise: {', '.join(others)}"]
     lines += ["", *_setting_lines(result)] if saved else []
     parts = [
         f"{row.name}: {row.residuals.text}"

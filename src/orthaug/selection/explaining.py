@@ -20,8 +20,10 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.columns import least_squares, span
 from orthaug._base.errors import InputError
+from orthaug._base.lines import plural
+from orthaug.analysis.catalogue import SMOOTH_FRICTION
 from orthaug.analysis.suspects import ODD_JUMPS, WIDTHS, changes_sign, is_level, suspect_text
-from orthaug.data.terms import CONSTANT, TermLibrary, outside_brackets
+from orthaug.data.terms import CONSTANT, TermLibrary, count_products, outside_brackets
 from orthaug.selection.learned_linearization import LearnedLinearization
 
 _RANK = 1e-9  # of the largest singular value
@@ -130,18 +132,23 @@ MOST_CANDIDATES = 3000
 TERM = "term"
 """The kind of a product of what the learner sees."""
 _PLAIN = ("coulomb", "quadratic_drag", "cubic", "square_root")
-_WIDE = tuple(
-    kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS
+_WIDE = (
+    *SMOOTH_FRICTION,
+    *(kind for kind in ("stribeck", "stribeck_gauss", "dead_zone", "saturation") if kind in WIDTHS),
 )
 # Times the median size of what a term acts on
 _WIDTHS = tuple(2.0 ** (i / 2) for i in range(-8, 3))
 _REFINED = 2.0  # how far, as a factor, a width is moved from where it was found
-_COMPLEXITY = dict.fromkeys(_PLAIN, 1) | {
+_COMPLEXITY = {
+    **dict.fromkeys(_PLAIN, 1),
+    **dict.fromkeys(SMOOTH_FRICTION, 3),
     "stribeck": 3,
     "stribeck_gauss": 3,
     "dead_zone": 4,
     "saturation": 4,
 }
+_FORMS = {"stribeck_gauss": "stribeck", "atan": "tanh"}
+"""Kinds that are another's on the same variable."""
 _OWN = 1e-4  # of a candidate's squared norm: what physics, learner and other terms must leave of it
 # Share of the learner: within this of the best the simpler term is taken
 _TIE, _TIE_UNKNOWN = (2e-4, 2e-3)
@@ -190,8 +197,8 @@ class Candidate:
 
     @property
     def form(self) -> tuple[str, str, int]:
-        """Key of the term without its width, with both kinds of a peak alike."""
-        return self.kind.removesuffix("_gauss"), *self.identity[1:]
+        """Key of the term without its width, with both kinds of a peak, or a bend, alike."""
+        return _FORMS.get(self.kind, self.kind), *self.identity[1:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,6 +268,20 @@ class Space:
         return float(np.sum((basis_of(chosen).T @ self.target) ** 2)) if len(chosen) else 0.0
 
 
+def check_products(signals: int, degree: int, functions: Sequence[str], places: int) -> None:
+    """Raise InputError where products of what a learner sees are too many, before work begins."""
+    _check_count(signals, degree, count_products(signals, degree, len(set(functions))) * places)
+
+
+def _check_count(signals: int, degree: int, count: int) -> None:
+    if count > MOST_CANDIDATES:
+        raise InputError(
+            f"{plural(signals, 'signal')} to the degree {degree} make {count} candidate "
+            f"terms; at most {MOST_CANDIDATES} are looked at. Lower the degree, or give fewer "
+            "functions."
+        )
+
+
 def candidates_of(
     linearization: LearnedLinearization,
     degree: int,
@@ -293,13 +314,7 @@ def candidates_of(
     ]
     wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
     places = range(len(linearization.places))
-    count = (len(texts) + len(wide)) * len(places)
-    if count > MOST_CANDIDATES:
-        raise InputError(
-            f"{linearization.seen} signals to the degree {degree} make {count} candidate "
-            f"terms; at most {MOST_CANDIDATES} are looked at. Lower the degree, or give fewer "
-            "functions."
-        )
+    _check_count(linearization.seen, degree, (len(texts) + len(wide)) * len(places))
     found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
     for place in places:
         found += [
@@ -316,7 +331,7 @@ def candidates_of(
 
 def _is_likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
     """Return whether a kind suits a variable: friction needs both signs, a root a positive one."""
-    if kind not in (*ODD_JUMPS, "square_root"):
+    if kind not in (*ODD_JUMPS, *SMOOTH_FRICTION, "square_root"):
         return True
     values = _values(linearization, on)
     return bool(np.isfinite(values).all()) and (
@@ -339,6 +354,8 @@ def _grid(linearization: LearnedLinearization, on: str) -> Iterator[float]:
 def _expression_text(kind: str, on: str | None, width: float | None = None) -> str:
     if kind == "cubic" and on is not None and not outside_brackets(on, "+-*/ "):
         return f"{on}**3"
+    if kind in SMOOTH_FRICTION and on is not None:
+        return SMOOTH_FRICTION[kind].expression(on, repr(width))
     return suspect_text(kind, on, width, lambda text: text, "v")[0]
 
 

@@ -29,13 +29,18 @@ from orthaug.selection.explaining import (
     Fit,
     Space,
     candidates_of,
+    check_products,
     nearest_twins,
     rivals,
     select,
     settle_terms,
     single_terms,
 )
-from orthaug.selection.learned_linearization import LearnedLinearization, linearization_of
+from orthaug.selection.learned_linearization import (
+    LearnedLinearization,
+    linearization_of,
+    signals_seen,
+)
 
 _DIVIDED = re.compile(r"\((?P<inner>.+)\)\s*/\s*(?P<by>[A-Za-z_]\w*)")
 
@@ -260,10 +265,18 @@ _NAMES = {
     "coulomb": "coulomb",
     "quadratic_drag": "drag",
     "stribeck_gauss": "stribeck",
+    "tanh": "friction",
+    "atan": "friction",
     TERM: "term",
 }
 # Of an input, such as a valve, the same functions are no friction
-_OF_INPUTS = {"coulomb": "jump", "stribeck": "peak", "stribeck_gauss": "peak"}
+_OF_INPUTS = {
+    "coulomb": "jump",
+    "stribeck": "peak",
+    "stribeck_gauss": "peak",
+    "tanh": "bend",
+    "atan": "bend",
+}
 
 
 @dataclass(frozen=True)
@@ -353,9 +366,9 @@ def explain(
 ) -> Explanation:
     """Find the terms that a learner holds: its output over a record on suspects and products.
 
-    Friction, drag, hardening, dead zones and saturations of everything that the learner sees are
-    tried, and products of it. Each is taken as the learner would show it, for a smooth one shows no
-    jumps (`selection.as_shown`).
+    Friction with a jump or smooth, drag, hardening, dead zones and saturations of everything that
+    the learner sees are tried, and products of it. Each is taken as the learner would show it, for
+    a smooth one shows no jumps (`selection.as_shown`).
 
     Args:
         model: a model with a learner, or what `estimate` returned.
@@ -391,6 +404,8 @@ def explain(
         raise InputError(
             f"`functions` must be a list of names, such as ['abs']; got {show(functions)}."
         )
+    if model.learns:
+        check_products(len(signals_seen(model)), degree, functions, model.form.bound.ny)
     linearization = linearization_of(model, record)
     space = Space.of(
         linearization,

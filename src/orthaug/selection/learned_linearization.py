@@ -98,6 +98,12 @@ class LearnedLinearization:
         return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
+def signals_seen(model: Model) -> tuple[str, ...]:
+    """Return what a learner sees, as expressions."""
+    features = model.form.features
+    return tuple(dict.fromkeys(map(str, getattr(features, "entries", features))))
+
+
 def linearization_of(model: Model, record: Record) -> LearnedLinearization:
     """Return the learner of a model over a record.
 
@@ -146,7 +152,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
     for entry in form.features.entries:
         constants |= dict(entry.constants)
     columns = {lag: x[:, j] for j, lag in enumerate(form.layout)}
-    own = tuple(dict.fromkeys(str(entry) for entry in form.features.entries))
+    own = signals_seen(model)
     c = model.theta - model.theta_aux
     return LearnedLinearization(
         target=target,
@@ -180,7 +186,7 @@ def _of_motion(model: Model[MotionDynamics], record: Record) -> LearnedLineariza
     slopes = np.nan_to_num(np.asarray(slopes_at(form, model.theta, x, u)))
     coordinates, count = motion.coordinates, len(model.theta)
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
-    own = tuple(dict.fromkeys(str(entry) for entry in form.features))
+    own = signals_seen(model)
     z = np.asarray(form.seen(x.T, u.T, np)).T
     units = model.units | {parameter.name: parameter.unit for parameter in motion.parameters}
     return LearnedLinearization(

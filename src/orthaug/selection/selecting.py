@@ -41,6 +41,7 @@ from orthaug.selection.term_path import (
     PathModel,
     TermPath,
     climb,
+    judge_all,
 )
 from orthaug.selection.term_runs import Point, TermRuns
 
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     pass
 
 _ITERATIONS = 40  # of a network on a fold
+_MUCH_BETTER = 0.5  # times the error of physics alone: terms that reach it are named, though unsure
+_NAMED = 3  # of them
 
 
 def search_learners(
@@ -239,10 +242,11 @@ def select(
     delays = tuple(
         Delay.of(record, i, largest.nk[i] + largest.nb[i], orders.chosen) for i in range(len(names))
     )
-    asked = _with_every_input(orders.chosen, largest)
+    even = [delay.correlation is None and delay.square is not None for delay in delays]
+    asked = _with_every_input(orders.chosen, largest, even)
     layout = [str(lag) for lag in asked.lags.layout(problem.outputs, names)]
     tested = nonlinearity(problem, layout) if layout else None
-    reach = _orders_with_inputs(orders.chosen, asked, tested, names)
+    reach = _orders_with_inputs(orders.chosen, asked, tested, names, even)
     search = _Search(problem, criterion, largest, blocks, collinear, level, heard, runner)
     path, found, physics, notes = search.beyond(learner, orders, reach, tested, widths, most)
     if heard.stopped:
@@ -312,16 +316,28 @@ class _Search:
             runs, self.blocks, at_most, self.heard.of("terms"), self.runner, near, linear, control
         )
         if not path.chosen.point.chosen:
-            notes.append(
-                Warning(
-                    "nothing_helps",
-                    "no term lowers the error on blocks without which it was picked.",
-                )
-            )
+            notes.append(_unconfirmed(path))
         physics = (
             kept_physics(runs, path.rungs[0].point, path.chosen.point) if baseline.names else None
         )
         return path, None, physics, notes + (physics.notes if physics else [])
+
+
+def _unconfirmed(path: TermPath) -> Warning:
+    """Return a note that no terms are chosen, with what those picked on all rows reach."""
+    text = "no term surely lowers the error on blocks without which it was picked."
+    alone = path.rungs[0].score
+    best = next(one.rung for one in judge_all(path.rungs) if one.chosen)
+    if best.size and best.score < _MUCH_BETTER * alone:
+        texts = path.runs.library.texts
+        names = ", ".join(texts[i] for i in best.point.chosen[:_NAMED])
+        more = " and more" if len(best.point.chosen) > _NAMED else ""
+        text += (
+            f" Picked on all rows, {names}{more} would lower it from {alone:.3g} to "
+            f"{best.score:.3g}, but without a block others are picked. Where these make sense, "
+            "declare them as terms of the physics."
+        )
+    return Warning("nothing_helps", text)
 
 
 def _parts(
@@ -414,26 +430,29 @@ class _Listener:
         return report
 
 
-def _with_every_input(chosen: Orders, largest: Orders) -> Orders:
-    """Return the chosen orders, and of inputs that they keep no lag of all that are allowed.
+def _with_every_input(chosen: Orders, largest: Orders, even: Sequence[bool]) -> Orders:
+    """Return the chosen orders, and of some inputs all lags that are allowed.
 
-    An even function of an input has no linear correlation with it, so no linear lag of the input
-    helps.
+    These are inputs without a lag, and those of which the square alone is correlated: of an `even`
+    function no linear lag helps but those that the physics reads.
     """
-    nb = tuple(n or most for n, most in zip(chosen.nb, largest.nb, strict=True))
-    nk = tuple(
-        k if n else first for n, k, first in zip(chosen.nb, chosen.nk, largest.nk, strict=True)
-    )
-    return replace(chosen, nb=nb, nk=nk)
+    every = [one or not n for one, n in zip(even, chosen.nb, strict=True)]
+    nb = [most if e else n for e, n, most in zip(every, chosen.nb, largest.nb, strict=True)]
+    nk = [first if e else k for e, k, first in zip(every, chosen.nk, largest.nk, strict=True)]
+    return replace(chosen, nb=tuple(nb), nk=tuple(nk))
 
 
 def _orders_with_inputs(
-    chosen: Orders, asked: Orders, tested: Nonlinearity | None, names: Sequence[str]
+    chosen: Orders,
+    asked: Orders,
+    tested: Nonlinearity | None,
+    names: Sequence[str],
+    even: Sequence[bool],
 ) -> Orders:
     """Return the chosen orders with the inputs that have only a nonlinear effect."""
     nb, nk = list(chosen.nb), list(chosen.nk)
     for i, name in enumerate(names):
-        if chosen.nb[i] or tested is None or not tested.found:
+        if (chosen.nb[i] and not even[i]) or tested is None or not tested.found:
             continue
         own = [
             k

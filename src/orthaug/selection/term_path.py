@@ -36,6 +36,8 @@ _PATIENCE = 5
 _BETTER = 0.005
 _FOLD_ITERATIONS = 10
 _ANEW = 5  # times that the terms are picked anew about the choice
+# Times the mean squared error of another model on every block: surely worse
+_FAR_WORSE = 2.0
 # Standard errors, and of the error of physics alone: what is better by both is confirmed
 _SURE, _HALF = (3.0, 0.5)
 _HALVES = 50  # random halves of the data over which terms are chosen again
@@ -100,7 +102,8 @@ def judge_all(rungs: Sequence[PathModel], terms: bool = True) -> tuple[RankedMod
         worse = rung.held - best.held if finite else np.full(count, np.inf)
         tolerated = worse.std(ddof=1) / np.sqrt(count) if finite else 0.0
         within = finite and (
-            float(worse.mean()) <= tolerated or rung.score <= (1 + WORTH) * best.score
+            (float(worse.mean()) <= tolerated and not _worse_everywhere(rung.held, best.held))
+            or rung.score <= (1 + WORTH) * best.score
         )
         spread_of = (
             rung.held.std(ddof=1) / np.sqrt(count) / (2 * rung.score)
@@ -112,6 +115,11 @@ def judge_all(rungs: Sequence[PathModel], terms: bool = True) -> tuple[RankedMod
     chosen = min(able, key=lambda i: (rungs[i].size, rungs[i].lags, rungs[i].score), default=0)
     found[chosen] = replace(found[chosen], chosen=True)
     return tuple(found)
+
+
+def _worse_everywhere(held: Vector, best: Vector) -> bool:
+    """Return whether a model is far worse on every block, however unequal these are."""
+    return bool(np.all(held > _FAR_WORSE * best))
 
 
 @dataclass(frozen=True, eq=False)
@@ -482,7 +490,8 @@ def _beyond_doubt(alone: Vector, held: Vector) -> bool:
     if not np.isfinite(held).all() or not np.isfinite(alone).all():
         return False
     error = float(worse.std(ddof=1)) / np.sqrt(len(held))
-    return bool(worse.mean() > _SURE * error and np.mean(held) < _HALF**2 * np.mean(alone))
+    sure = worse.mean() > _SURE * error or _worse_everywhere(alone, held)
+    return bool(sure and np.mean(held) < _HALF**2 * np.mean(alone))
 
 
 def _backward(path: TermPath, judged: Any) -> None:
