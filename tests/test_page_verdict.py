@@ -15,7 +15,13 @@ from orthaug.analysis.findings import (
     DiagnosisResult,
     ValidationResult,
 )
-from orthaug.analysis.fit_findings import ParameterResult, PartScores, ScoreResult, StatusResult
+from orthaug.analysis.fit_findings import (
+    NoiseResult,
+    ParameterResult,
+    PartScores,
+    ScoreResult,
+    StatusResult,
+)
 from orthaug.reports.page_verdict import compare_verdict, fit_verdict
 from orthaug.reports.result import CompareResult, DataResult, DifferenceResult, FitResult, RowResult
 from orthaug.reports.text import compare_text
@@ -96,6 +102,19 @@ def test_a_refuted_model_is_of_use_for_the_next_sample_only_where_that_is_predic
     )
     assert "predict the next" not in fit_verdict(fitted(0.4, 3.0)).use
     assert "simulate within" in fit_verdict(fitted(0.7, 0.1)).use
+
+
+def test_a_noise_model_keeps_feedback_right_and_predicts_where_its_free_run_drifts():
+    noise = [NoiseResult.model_construct(output="y", model="innovations")]
+    looped = [Warning(code="closed_loop", text=""), Warning(code="short_for_noise", text="")]
+    said = fit_verdict(fitted(0.03, 5.0, warnings=looped, noise=noise))
+    assert said.use.startswith("Use it to predict the next sample. Do not read a as physics yet")
+    assert "biases the estimates" not in said.trust
+    assert "a noise model needs complete physics" in said.trust
+    alone = fit_verdict(fitted(0.03, 5.0, warnings=looped))
+    assert alone.use.startswith("Use it only to search for missing physics")
+    assert "feedback, which biases the estimates" in alone.trust
+    assert "predict" not in fit_verdict(fitted(0.9, 5.0, warnings=looped, noise=noise)).use[:20]
 
 
 def test_a_learner_that_was_tried_and_is_not_better_is_not_advised():

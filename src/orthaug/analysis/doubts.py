@@ -239,9 +239,7 @@ def _term_of(result: Findings, family: FamilyTest) -> str:
     return f" ({best.expression}, most likely)" if same else ""
 
 
-def with_found_change(
-    fit: Any, result: F, found: str, *, nearly_all: bool = False
-) -> F:
+def with_found_change(fit: Any, result: F, found: str, *, nearly_all: bool = False) -> F:
     """Return the findings after a change that lowers the error to below a half.
 
     One that took what is left for a disturbance refers to the change instead. Where the change

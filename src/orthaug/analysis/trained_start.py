@@ -165,6 +165,13 @@ def judged_record(fit: Estimate) -> Record:
     return replace(record, experiments=tuple(pieces))
 
 
+def unstable_segment(fit: Estimate) -> int:
+    """Return after how many samples the runs of an unstable plant start anew; 0 of a stable one."""
+    if not isinstance(fit, MotionEstimate) or _begins(fit) is None:
+        return 0
+    return fit.segmented.segments.steps
+
+
 def _begins(fit: MotionEstimate) -> list[list[int]] | None:
     """Return the first rows of the segments of an unstable plant; None of a stable one."""
     segmented = fit.segmented
@@ -213,8 +220,7 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     begin = "the state that its first rows give, and the model remembers the error of that"
     remedy = "more rows to start from (--initial)"
     response = replace(free_run, trajectories=tuple(trajectories))
-    segment = 0 if begins is None else fit.segmented.segments.steps
-    return TrainedRun(response, begin, remedy, states, segment)
+    return TrainedRun(response, begin, remedy, states, unstable_segment(fit))
 
 
 def _joined(pieces: list[Run]) -> Run:

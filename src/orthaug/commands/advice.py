@@ -20,6 +20,7 @@ from orthaug._base.lines import join_words, plural
 from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
+from orthaug.analysis.trained_start import unstable_segment
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.proposals import (
     Proposal,
@@ -81,6 +82,24 @@ class ValidationRows:
             )
         training, held = held_out_blocks(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
+
+    def in_segments(self, steps: int) -> ValidationRows:
+        """Return the rows with free runs that start anew: no run of an unstable plant lasts."""
+        count = len(self.held.experiments)
+        skips = self.skips if isinstance(self.skips, tuple) else (self.skips,) * count
+        pieces = [
+            one.rows(first, min(first + steps, len(one)))
+            for one, skip in zip(self.held.experiments, skips, strict=True)
+            for first in range(skip, len(one), steps)
+            if len(one) - first > steps // 2
+        ]
+        if not pieces:
+            return self
+        every = steps * self.held.sampling_time
+        where = f"{self.where}, begun anew every {every:.3g} s,"
+        return replace(
+            self, held=replace(self.held, experiments=tuple(pieces)), skips=0, where=where
+        )
 
     def prepared(self, step: Any, missing: str) -> ValidationRows:
         """Return the rows after a further step of preparation; what is `missing` as in a spec.
@@ -252,6 +271,8 @@ def _tried(
         rows = ValidationRows.of(job)
     except InputError:
         return None
+    if segment := unstable_segment(fit):
+        rows = rows.in_segments(segment)
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))

@@ -316,7 +316,11 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
     if _has_warning(result, "closed_loop"):
-        yield "its data were probably recorded under feedback, which biases the estimates"
+        yield "its data were probably recorded under feedback, " + (
+            "where a noise model needs complete physics and enough orders"
+            if result.noise
+            else "which biases the estimates"
+        )
     worse = _worse(result.scores)
     if worse is not None:
         times = number(worse[0], 2)
@@ -393,7 +397,8 @@ def _use_text(result: FitResult, level: str) -> str:
             f"prediction {_place_of(part)} is {percent(ahead)} of the output's standard deviation, "
             "too."
         )
-    if level == "bad" and not (known and predicts):
+    # A noise model is there to predict; without one any slow output is predicted well by its past
+    if level == "bad" and not (predicts and (known or result.noise)):
         return f"{_SEARCH_ONLY}."
     if level == "bad" or _has_warning(result, _UNSTABLE):
         text = "predict the next sample"
