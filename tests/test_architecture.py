@@ -59,7 +59,6 @@ ENTRIES = {
 CONCEPTS = {
     "_base.kept_programs": "traced programs on disk",
     "analysis.amplitude_dependence": "the nearest linear system over movements of some size",
-    "models.controller_states": "what a controller has read until a row",
     "data.units": "units, read by a library",
     "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
@@ -69,7 +68,6 @@ CONCEPTS = {
     "physics.mechanisms": "a kind of source",
     "analysis.exchanged_inputs": "a mistake in the spec that the data show",
     "analysis.free_run_stability": "all checks of stability together",
-    "analysis.independence": "a test of residuals",
     "analysis.observer": "the verb `observe`",
     "analysis.term_sensitivities": "slopes of a free run by terms that are added to it",
     "analysis.plant": "systems simulated for many inputs side by side",
@@ -83,7 +81,6 @@ CONCEPTS = {
     "fitting.noise_estimation": "coefficients and orders of noise models",
     "fitting.recursive_storage": "the format of a saved recursive estimate",
     "fitting.segmented_streamed": "segments of rows that remain in a source",
-    "fitting.warm_motion": "training of a motion that goes on from an earlier model",
     "models.devices": "an engine, an entry of the registry",
     "reports.figures": "figures from Python",
     "reports.linear_text": "linear views in words",

@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 from scipy.signal import lfilter
 
 from orthaug.analysis.findings import SuspectResult
-from orthaug.analysis.independence import against_regressor
 from orthaug.analysis.residual_tests import ResidualTestResult
-from orthaug.analysis.residuals import analyse
+from orthaug.analysis.residuals import against_regressor, analyse
 from orthaug.reports import plots
 from orthaug.reports.biases import bias_map
 from orthaug.reports.finding_plots import bias_figure, residual_analysis_figure

@@ -10,9 +10,8 @@ import scipy.stats
 from scipy.signal import lfilter
 
 from orthaug import InputError
-from orthaug.analysis.independence import against_input, against_regressor
 from orthaug.analysis.residual_tests import ResidualTestResult
-from orthaug.analysis.residuals import analyse
+from orthaug.analysis.residuals import against_input, against_regressor, analyse
 from orthaug.fitting.whiteness import (
     autocorrelation,
     cross_correlation,

@@ -737,7 +737,7 @@ def architecture(names: Names) -> Figure:
         w=1.75,
         colour=GREEN,
     )
-    part(8.1, 2.75, "elsewhere", "export/lowering.py\nexport/c_arithmetic.py", w=1.75, colour=GREEN)
+    part(8.1, 2.75, "elsewhere", "export/lowering.py\nexport/c_source.py", w=1.75, colour=GREEN)
     part(
         8.1,
         1.4,

@@ -13,8 +13,8 @@ from .analysis import stability as stability
 from .analysis import suspected_bias as suspected_bias
 from .analysis import verdict as verdict
 from .analysis.design import design_motion_input as design_motion_input
+from .analysis.free_run_equations import substep_bias as substep_bias
 from .analysis.linear_view import LinearView as LinearView
-from .analysis.motion_response import substep_bias as substep_bias
 from .commands import fit_spec as fit_spec
 from .commands import load_spec as load_spec
 from .commands.library import compare as compare

@@ -1,9 +1,9 @@
 """Bias of a motion's parameters by terms that its equations may lack, and the evidence for them.
 
-The free run answers for what the fit determines: a term moves these parameters as `motion_response`
-says. Along the directions that the learner could imitate the nearest physics decides, so that there
-a term moves p̂ by what the measure makes of it (`bias`), with the slopes ∂f/∂q of the learned
-equations over the measure's points for Φ.
+The free run answers for what the fit determines: a term moves these parameters by its normal
+equations (`free_run_equations`). Along the directions that the learner could imitate the nearest
+physics decides, so that there a term moves p̂ by what the measure makes of it (`bias`), with the
+slopes ∂f/∂q of the learned equations over the measure's points for Φ.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from orthaug.analysis.bias import (
 from orthaug.analysis.bias_hull import MOST_PHYSICS
 from orthaug.analysis.catalogue import Catalogue, soften_jumps
 from orthaug.analysis.causes import AS_CLOSE, CLOSE, MOST_POINTS, SURE_SHARE, Considered
+from orthaug.analysis.free_run_equations import FreeRunPoint, TermEquations, respond_to
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.motion_response import FreeRunPoint, TermsResponse, respond_to
 from orthaug.analysis.robustness import block_of
 from orthaug.analysis.suspects import MotionSuspect, check_motion_suspects
 from orthaug.fitting.field_points import field_under
@@ -178,7 +178,7 @@ class MotionTerms:
 
     def _response(
         self,
-        response: TermsResponse,
+        response: TermEquations,
         k: int,
         suspect: MotionSuspect,
         seen: bool | None,
@@ -312,7 +312,7 @@ class MotionTerms:
 
 
 def residual_steps(
-    response: TermsResponse, used: float, steps: int | None
+    response: TermEquations, used: float, steps: int | None
 ) -> list[ResidualStep | None]:
     """Return the effect of every term on the residual, with standard errors.
 

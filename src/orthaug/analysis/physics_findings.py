@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, partial, singledispatch
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import MeasureResult, physical_rows
 from orthaug.analysis.free_run_bias import linearize_fit
+from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.imitation import Imitation, MotionImitation, imitation
 from orthaug.analysis.learned_part import equation_parts
 from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
-from orthaug.analysis.motion_response import substep_bias
 from orthaug.analysis.other_solutions import find_other_solution
 from orthaug.analysis.trained_start import judged_record
 from orthaug.fitting.elimination import directions
@@ -69,6 +69,7 @@ def describe_physics(fit: Estimate) -> dict[str, Any]:
     }
 
 
+@singledispatch
 def analyse_physics(
     fit: Estimate,
     evidence: Evidence,
@@ -81,20 +82,25 @@ def analyse_physics(
     Args:
         one_step: prediction of the training data, and `free_run` over them.
     """
-    if isinstance(fit, MotionEstimate):
-        return _of_motion(fit, evidence, one_step, free_run, warnings)
-    assert isinstance(fit, LaggedEstimate)
-    return _of_lagged(fit, evidence, one_step, free_run, warnings)
+    raise NotImplementedError
 
 
+@singledispatch
 def imitable(fit: Estimate, evidence: Evidence) -> tuple[Imitation | None, list[Warning]]:
     """Return what the learner of a fit could imitate, and warnings on what it nearly could.
 
     None without a learner, or where the structure splits nothing along chosen directions.
     """
-    if isinstance(fit, LaggedEstimate):
-        return imitable_before(fit.problem, evidence, fit)
-    assert isinstance(fit, MotionEstimate)
+    raise NotImplementedError
+
+
+@imitable.register(LaggedEstimate)
+def _(fit: LaggedEstimate, evidence: Evidence) -> tuple[Imitation | None, list[Warning]]:
+    return imitable_before(fit.problem, evidence, fit)
+
+
+@imitable.register(MotionEstimate)
+def _(fit: MotionEstimate, evidence: Evidence) -> tuple[Imitation | None, list[Warning]]:
     if not fit.status.ok or not fit.learns:
         return None, []
     seen = [str(entry) for entry in fit.model.form.features]
@@ -143,6 +149,7 @@ def bias_before(evidence: Evidence, weighed: WeighedPhysics) -> list[dict[str, A
     return bias_under(terms, evidence.suspects, certify_usual=True)
 
 
+@analyse_physics.register(LaggedEstimate)
 def _of_lagged(
     fit: LaggedEstimate,
     evidence: Evidence,
@@ -220,6 +227,7 @@ def _terms(fit: LaggedEstimate, evidence: Evidence) -> LaggedTerms:
     return LaggedTerms(weighed, problem, fit.theta, evidence.map, learned, fit.model.shared, fit)
 
 
+@analyse_physics.register(MotionEstimate)
 def _of_motion(
     fit: MotionEstimate,
     evidence: Evidence,

@@ -18,7 +18,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.jax import AnyArray
 from orthaug._base.lines import join_words, percent
-from orthaug.analysis.motion_response import FreeRunPoint
+from orthaug.analysis.free_run_equations import FreeRunPoint
 from orthaug.analysis.residuals import errors_of, rms_errors
 from orthaug.data.columns import quantum_of
 from orthaug.data.record import Record

@@ -2,13 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from orthaug._base.checks import free_name
-from orthaug.export import c_arithmetic
-from orthaug.export.c_arithmetic import FIELD_WORDS
-from orthaug.export.program import Program, Signal, Vectors
+from orthaug.export.nodes import (
+    ACTIVATIONS,
+    SHARED_NAMES,
+    Language,
+    decimal,
+    functions_in,
+    names_in,
+    wrap_items,
+)
+from orthaug.export.program import Block, Constant, Layer, Program, Signal, Vectors
+
+_MATH = {*SHARED_NAMES, "atan", "atan2"}
+_OWN = {
+    "sign": "static real sign(real a) { return a > 0 ? 1 : a < 0 ? -1 : a; } /* NaN stays NaN */",
+    "min": "static real least(real a, real b) { return a < b || isnan(a) ? a : b; }",
+    "max": "static real largest(real a, real b) { return a > b || isnan(a) ? a : b; }",
+    "square": "static real square(real a) { return a * a; }",
+    "whole_power": """static real whole_power(real base, int n)
+{
+    real value = 1;
+    unsigned left = n < 0 ? 0u - (unsigned)n : (unsigned)n;
+    for (; left; left >>= 1, base *= base)
+        if (left & 1u) value *= base;
+    return n < 0 ? 1 / value : value;
+}""",
+}
+_NAMES = {name: f"{name}_" for name in _MATH} | {
+    "abs": "fabs_",
+    "power": "pow_",
+    "sign": "sign",
+    "min": "least",
+    "max": "largest",
+}
+_WORDS = """
+auto break case char const continue default do double else enum extern float for goto if
+inline int long register restrict return short signed sizeof static struct switch typedef
+union unsigned void volatile while flag class bool true false new delete this template
+operator private public protected namespace try catch throw using
+typename virtual friend explicit export mutable and or not xor real
+"""
+FIELD_WORDS = frozenset(_WORDS.split())
+"""Names that a field of the state cannot have, in C or in C++."""
+_RK4 = """
+static void substep(real x[NX], const real first[], const real middle[], const real last[])
+{
+    real k1[NX], k2[NX], k3[NX], k4[NX], at[NX];
+    int i;
+    rate(x, first, k1);
+    for (i = 0; i < NX; i++) at[i] = x[i] + step / 2 * k1[i];
+    rate(at, middle, k2);
+    for (i = 0; i < NX; i++) at[i] = x[i] + step / 2 * k2[i];
+    rate(at, middle, k3);
+    for (i = 0; i < NX; i++) at[i] = x[i] + step * k3[i];
+    rate(at, last, k4);
+    for (i = 0; i < NX; i++) x[i] += step / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+}"""
+_EXACT = """static void add_product(const real m[NX][NX], const real v[NX], real sum[NX])
+{
+    int i, j;
+    for (i = 0; i < NX; i++)
+        for (j = 0; j < NX; j++) sum[i] += m[i][j] * v[j];
+}
+
+/* What the linear part leaves of the rate. */
+static void rest(const real x[NX], const real u[], real r[NX])
+{
+    int i, j;
+    rate(x, u, r);
+    for (i = 0; i < NX; i++)
+        for (j = 0; j < NX; j++) r[i] -= m_linear[i][j] * x[j];
+}
+
+static void substep(real x[NX], const real first[], const real middle[], const real last[])
+{
+    real begin[NX], at_a[NX], at_b[NX], at_c[NX], a[NX], b[NX], c[NX], next[NX];
+    int i;
+    for (i = 0; i < NX; i++) a[i] = b[i] = c[i] = next[i] = 0;
+    rest(x, first, begin);
+    add_product(m_half, x, a);
+    add_product(m_half1, begin, a);
+    rest(a, middle, at_a);
+    add_product(m_half, x, b);
+    add_product(m_half1, at_a, b);
+    rest(b, middle, at_b);
+    for (i = 0; i < NX; i++) at_c[i] = 2 * at_b[i] - begin[i];
+    add_product(m_half, a, c);
+    add_product(m_half1, at_c, c);
+    rest(c, last, at_c);
+    for (i = 0; i < NX; i++) at_a[i] += at_b[i];
+    add_product(m_whole, x, next);
+    add_product(m_first, begin, next);
+    add_product(m_middle, at_a, next);
+    add_product(m_last, at_c, next);
+    for (i = 0; i < NX; i++) x[i] = next[i];
+}"""
 
 
 @dataclass(frozen=True)
@@ -166,7 +260,7 @@ def _source(program: Program, fields: list[tuple[str, Signal, int]]) -> str:
 typedef {name}_real real;
 #define R(number) ((real)(number))
 
-{c_arithmetic.arithmetic(program)}
+{arithmetic(program)}
 
 void {name}_start({name}_state *state)
 {{
@@ -207,7 +301,7 @@ def _lagged_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str
     """Return the block on the state's fields, and the lines that shift the state by one sample."""
     place = [f"state->{place}" for place in places_of(fields)]
     lines = [*_step_head(program), "    int i, ok = 1;"]
-    lines += c_arithmetic.body(
+    lines += body(
         program.output, "y", lambda vector, i: place[i] if vector == "x" else f"{vector}[{i}]"
     )
     lines += _checks(program, following=False)
@@ -230,7 +324,7 @@ def _motion_step(program: Program, fields: list[tuple[str, Signal, int]]) -> str
     lines += [f"    x[{i}] = state->{identifier};" for i, (identifier, *_) in enumerate(fields)]
     lines += [
         "    output(x, u, y);",
-        *c_arithmetic.advance(program),
+        *advance(program),
         *_checks(program, following=True),
     ]
     lines += [f"    state->{identifier} = x[{i}];" for i, (identifier, *_) in enumerate(fields)]
@@ -294,3 +388,179 @@ int main(void)
     return flagged || !(worst <= allowed * (largest > 1e-300 ? largest : 1));
 }}
 """
+
+
+def _language(entry: Callable[[str, int], str]) -> Language:
+    return Language(_NAMES, _number, _power, entry=entry)
+
+
+def _number(value: float) -> str:
+    if not np.isfinite(value):
+        return "R(NAN)" if np.isnan(value) else f"R({'-' * (value < 0)}INFINITY)"
+    return f"R({decimal(value)})"
+
+
+def _power(base: str, n: int) -> str:
+    return f"square({base})" if n == 2 else f"whole_power({base}, {n})"
+
+
+def _plain(vector: str, index: int) -> str:
+    return f"{vector}[{index}]"
+
+
+def arithmetic(program: Program) -> str:
+    """Return the code before the functions that the header declares."""
+    parts = [_functions(program)]
+    parts += [
+        "\n".join(
+            f"static const real {c.name} = {_number(c.value)}; /* {_safe(c.meaning)} */"
+            for c in _used_constants(program)
+        )
+    ]
+    for name in sorted(program.activations - {"identity"}):
+        written = _language(_plain).write(ACTIVATIONS[name])
+        parts.append(f"static real act_{name}(real a) {{ return {written}; }}")
+    parts += [_network(block) for block in program.blocks if block.network is not None]
+    if program.rate is not None:
+        parts += [_function(block, program) for block in program.blocks]
+        parts += _integrator(program)
+    return "\n\n".join(part for part in parts if part)
+
+
+def _safe(text: str) -> str:
+    return text.replace("*/", "* /").replace("/*", "/ *")
+
+
+def _used_constants(program: Program) -> list[Constant]:
+    """Return constants that some block reads: compilers warn of an unused one."""
+    read = set[str]().union(*(names_in(node) for block in program.blocks for node in block.nodes))
+    return [constant for constant in program.constants if constant.name in read]
+
+
+def _functions(program: Program) -> str:
+    """Return names of mathematical functions for either precision, and those that C lacks."""
+    wanted = program.functions | set[str]().union(
+        *(functions_in(ACTIVATIONS[name]) for name in program.activations)
+    )
+    called = sorted(
+        {"abs": "fabs", "power": "pow"}.get(name, name)
+        for name in wanted & (_MATH | {"abs", "power"})
+    )
+    upper = program.name.upper()
+    lines = []
+    if called:
+        lines += [
+            f"#ifdef {upper}_FLOAT",
+            *(f"#define {name}_ {name}f" for name in called),
+            "#else",
+        ]
+        lines += [*(f"#define {name}_ {name}" for name in called), "#endif"]
+    return "\n".join([*lines, *(text for name, text in _OWN.items() if name in wanted)])
+
+
+def _table(name: str, values: np.ndarray) -> str:
+    if values.ndim == 1:
+        return (
+            f"static const real {name}[{len(values)}] = "
+            f"{{\n{wrap_items(list(map(_number, values)), ' ' * 4)}\n}};"
+        )
+    rows = ",\n".join(
+        f"    {{{wrap_items(list(map(_number, row)), ' ' * 5).strip()}}}" for row in values
+    )
+    return f"static const real {name}[{values.shape[0]}][{values.shape[1]}] = {{\n{rows}\n}};"
+
+
+def _network(block: Block) -> str:
+    """Return the tables of a network and the function that evaluates it."""
+    assert block.network is not None
+    layers, parts, declared, loops = block.network.layers, [], [], []
+    for i, layer in enumerate(layers, start=1):
+        parts.append(_table(f"{block.name}_w{i}", layer.weight))
+        if layer.bias is not None:
+            parts.append(_table(f"{block.name}_b{i}", layer.bias))
+        target, source = "g" if i == len(layers) else f"h{i}", "z" if i == 1 else f"h{i - 1}"
+        if target != "g":
+            declared.append(f"    real {target}[{len(layer.weight)}];")
+        loops.append(_layer(f"{block.name}_", i, layer, target, source))
+    first, last = layers[0].weight.shape[1], len(layers[-1].weight)
+    head = f"static void {block.name}_learner(const real z[{first}], real g[{last}])\n{{"
+    return "\n".join([*parts, "", head, *declared, "    int i, j;", *loops, "}"])
+
+
+def _layer(prefix: str, number: int, layer: Layer, target: str, source: str) -> str:
+    rows, columns = layer.weight.shape
+    start = "0" if layer.bias is None else f"{prefix}b{number}[i]"
+    value = "sum" if layer.activation == "identity" else f"act_{layer.activation}(sum)"
+    return f"""    for (i = 0; i < {rows}; i++) {{
+        real sum = {start};
+        for (j = 0; j < {columns}; j++) sum += {prefix}w{number}[i][j] * {source}[j];
+        {target}[i] = {value};
+    }}"""
+
+
+def body(block: Block, result: str, entry: Callable[[str, int], str] = _plain) -> list[str]:
+    """Return the lines that evaluate a block, in braces of their own, into the vector `result`."""
+    write = _language(entry).write
+    lines = [f"const real {name} = {write(node)};" for name, node in block.locals]
+    if block.network is not None:
+        features = block.network.features
+        lines.append(f"real z[{len(features)}], g[{len(block.network.layers[-1].weight)}];")
+        lines += [f"z[{i}] = {write(node)};" for i, node in enumerate(features)]
+        lines.append(f"{block.name}_learner(z, g);")
+    lines += [f"{result}[{i}] = {write(node)};" for i, node in enumerate(block.results)]
+    return ["    {", *(f"        {line}" for line in lines), "    }"]
+
+
+def _function(block: Block, program: Program) -> str:
+    result = "dx" if block is program.rate else "y"
+    unused = ["    (void)x;", "    (void)u;"]
+    head = f"static void {block.name}(const real x[], const real u[], real {result}[])\n{{"
+    return "\n".join([head, *unused, *body(block, result), "}"])
+
+
+def advance(program: Program) -> list[str]:
+    """Return the lines of a step that make `x` the next state."""
+    scheme = program.scheme
+    assert scheme is not None
+    n = len(program.states)
+    if scheme.kind == "discrete":
+        return [
+            "    {",
+            f"        real dx[{n}];",
+            "        rate(x, u, dx);",
+            f"        for (i = 0; i < {n}; i++) x[i] = dx[i];",
+            "    }",
+        ]
+    if program.ends == 1:
+        return [f"    for (i = 0; i < {scheme.substeps}; i++) substep(x, u, u, u);"]
+    held, halves = program.held, 2 * scheme.substeps
+    points = ("first", "middle", "last")
+    return [
+        f"    for (i = 0; i < {halves}; i += 2) {{",
+        f"        real {', '.join(f'{point}[{held}]' for point in points)};",
+        "        int j;",
+        f"        for (j = 0; j < {held}; j++) {{",
+        f"            const real slope = (u[{held} + j] - u[j]) / {halves};",
+        *(
+            f"            {point}[j] = u[j] + (real)(i{f' + {k}' * (k > 0)}) * slope;"
+            for k, point in enumerate(points)
+        ),
+        "        }",
+        "        substep(x, first, middle, last);",
+        "    }",
+    ]
+
+
+def _integrator(program: Program) -> list[str]:
+    scheme = program.scheme
+    assert scheme is not None
+    n = len(program.states)
+    if scheme.kind == "discrete":
+        return []
+    if scheme.kind == "rk4":
+        return [
+            f"static const real step = {_number(scheme.step)}; /* s "
+            f"*/\n{_RK4.replace('NX', str(n))}"
+        ]
+    tables = [_table(f"m_{name}", matrix) for name, matrix in scheme.matrices]
+    return ["\n".join(tables), _EXACT.replace("NX", str(n))]

@@ -36,7 +36,12 @@ from orthaug.fitting.innovations import (
 from orthaug.fitting.kinds import CRITERIA, Solver, declared_by_name
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.learned import Task
-from orthaug.fitting.motion_task import MotionTask
+from orthaug.fitting.motion_task import (
+    MotionTask,
+    WarmMotionTask,
+    check_initial_motion,
+    with_its_memory,
+)
 from orthaug.fitting.noise import Noise, declared_noise, noise_of_motion
 from orthaug.fitting.noise_estimation import check_noise, fit_coloured
 from orthaug.fitting.one_step import OneStepTask
@@ -44,7 +49,6 @@ from orthaug.fitting.rules import check_motion_choices, check_no_memory
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice
-from orthaug.fitting.warm_motion import WarmMotionTask, check_initial_motion, with_its_memory
 from orthaug.inference.covariance import whitening_matrix
 from orthaug.inference.measures import Training
 from orthaug.models.learners import MLP, Learner, Scaling, declared, learns

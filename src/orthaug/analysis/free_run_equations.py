@@ -1,4 +1,4 @@
-"""Response of a motion's estimate to further terms in its equations, by normal equations.
+"""Normal equations of a free run: the response of an estimate to further terms in its physics.
 
 With S the sensitivities of the free run to the parameters' coordinates c, the terms' coefficients κ
 and a learner's weights w, the starts eliminated, a term of size κ that the fit does not know moves
@@ -110,7 +110,7 @@ class FreeRunPoint:
 
 
 @dataclass(frozen=True, eq=False)
-class TermsResponse:
+class TermEquations:
     """Normal equations of (c, κ, w), the starts eliminated.
 
     `fitted` are those that a fit has, κ left out.
@@ -232,7 +232,7 @@ class TermsResponse:
         return row, float(self.information[i, i] + across @ row[self.fitted])
 
 
-def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsResponse:
+def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermEquations:
     """Linearise a free run with further terms, and with all that its learner could hold."""
     motion = place.segmented.problem.motion
     segmented = place.segmented.with_signals(_signals(place, added))
@@ -250,7 +250,7 @@ def respond_to(place: FreeRunPoint, added: tuple[SuspectedTerm, ...]) -> TermsRe
         [place.inside, np.zeros(len(added), dtype=bool), np.ones(len(w), dtype=bool)]
     )
     own = (information, gradient, slope, fitted, len(added), segmented.segments)
-    return TermsResponse(place, form, numbers, *own)
+    return TermEquations(place, form, numbers, *own)
 
 
 def _signals(place: FreeRunPoint, added: Sequence[SuspectedTerm]) -> list[Matrix]:
