@@ -782,7 +782,7 @@ def saved(tmp_path, monkeypatch) -> Path:
     [
         (
             ("out", "--to", "cassadi", "--out", "new"),
-            "no export to 'cassadi', did you mean 'casadi'?; known are c, ",
+            "no export to 'cassadi', did you mean 'casadi'? Known are c, ",
         ),
         (("out", "--to", "c", "--out", "theirs"), "theirs: holds notes.txt"),
         (("out", "--to", "c", "--out", "file/new"), "file/new: cannot be written"),

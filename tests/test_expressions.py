@@ -201,7 +201,7 @@ REFUSED = [
     ("None", "None is not a number"),
     ("...", "Ellipsis is not a number"),
     ("1j", "1j is not a number"),
-    ("sinh(y[k-1])", "unknown function 'sinh', did you mean 'sin'\\?; known are sin, cos"),
+    ("sinh(y[k-1])", "unknown function 'sinh', did you mean 'sin'\\? Known are sin, cos"),
     ("squirt(y[k-1])", "unknown function 'squirt', did you mean 'sqrt'"),
     ("besselj(1)", "unknown function 'besselj'; known are"),
     ("sin()", "sin takes one argument, got 0"),

@@ -12,6 +12,7 @@ import pytest
 from test_cli import finite_json, run
 
 import orthaug as oa
+from orthaug.analysis.input_timing import rows_of_trials
 from orthaug.physics.integrators import INTEGRATORS, Integrator
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -241,10 +242,19 @@ def test_a_stiff_motor_is_fitted_and_the_remedy_of_many_substeps_is_right(motor)
         low, high = one["ci95"]
         assert low < truth < high and high - low < 1.5 * truth, one
     text = '`integrator = "exact"` needs far fewer.'
-    assert text in warning_of("stiff", run("check", str(motor('integrator = "rk4"')), "--json"))
+    done = run("check", str(motor('integrator = "rk4"')), "--json")
+    assert text in warning_of("stiff", done)
+    assert done.err.startswith("note: about 24 substeps in a sample make every run slow")
     assert "equilibrium" in warning_of(
         "stiff", run("check", str(motor(friction="0.5*tanh(speed)")), "--json")
     )
+
+
+@pytest.mark.parametrize(
+    ("chosen", "rows"), [("", 600), ("substeps = 70", 571), ("substeps = 99", 500)]
+)
+def test_where_a_sample_takes_many_substeps_fewer_rows_are_tried(motor, chosen, rows):
+    assert rows_of_trials(oa.load_spec(motor(chosen)).problem) == rows
 
 
 def warning_of(code, done):

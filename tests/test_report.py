@@ -589,9 +589,10 @@ def test_a_witness_is_told_where_runs_are_shown(lagged):
 
 
 def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
-    told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3"
+    told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3, by 5 % or −1 %"
     page = replace(lagged, result=with_warning(lagged, "small_margin", told)).report().html
-    assert "moves a by −0.015, see <code>a-1</code>: y[k-1] goes from −2 to 3" in page
+    words = "moves a by −J0.015, see <code>a-1</code>: y[k-1] goes from −J2 to 3, by 5N% or −J1N%"
+    assert words.replace("J", "\u2060").replace("N", "\xa0") in page  # no line ends within these
     whole = [
         "".join(text)
         for _, given, text in Read(page).found

@@ -115,7 +115,7 @@ def test_data_width_is_the_median_of_what_moves():
     [
         (
             {"kind": "columb", "on": "v[k-1]"},
-            r"unknown kind of suspect 'columb', did you mean 'coulomb'\?; known are coul",
+            r"unknown kind of suspect 'columb', did you mean 'coulomb'\? Known are coul",
         ),
         ({"kind": "", "on": "v[k-1]"}, r"unknown kind of suspect ''"),
         ({"kind": "cubic"}, r"a suspect of kind cubic needs `on`, an expression such as v\[k-1\]"),

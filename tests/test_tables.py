@@ -453,12 +453,12 @@ REFUSED_TEXT = [
     ("run.csv", "u,y\n1,2\n3,4,5\n", "line 3.*3 cells.*2"),
     ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
     ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),
-    ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'.; the file has 'U', 'y'"),
+    ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'. The file has 'U', 'y'"),
     ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
     ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
     ("run.csv", "u,y,y\n1,2,3\n", "column 'y' 2 times; names must differ"),
     ("run.txt", "1 2\n3 4\n5 6 7\n", "no column 'u': the file has no header"),
-    ("run.tsv", "u,y\n1,2\n", "no column 'u'.*the file has 'u,y'"),
+    ("run.tsv", "u,y\n1,2\n", "no column 'u'.*The file has 'u,y'"),
     ("run.xml", "<a/>", r"unknown file type '.xml'; known are .csv, .tsv, .txt, .dat, .parquet"),
     ("run", "u,y\n1,2\n", "unknown file type ''; known are .csv"),
     ("run.npz", b"not a zip", "cannot be read as .npz .*cut or corrupt"),
@@ -504,7 +504,7 @@ def test_a_folder_is_no_file(tmp_path):
 
 
 REFUSED_NPZ = [
-    ("v", {"vel": np.ones(3)}, r"no variable 'v', did you mean 'vel'\?; the file holds vel \(3\)"),
+    ("v", {"vel": np.ones(3)}, r"no variable 'v', did you mean 'vel'\? The file holds vel \(3\)"),
     (
         "y",
         {"a": np.ones((2, 3)), "b": 1.0},

@@ -17,6 +17,7 @@ _FEW = 4  # entries of an array that is shown
 _MOST, _HEAD = (1200, 900)
 _SEARCHED = 6 * _MOST  # characters that are looked at for names and values
 _QUOTED = re.compile(r"""(?<!\w)(['"`])(?!\1)(.*?)\1(?!\w)""")
+_HINTED = re.compile(r"(did you mean '[^']*'\?)[;,] (\w)")  # behind a question a sentence begins
 _LISTED = re.compile(r"\[[^][]+\]")
 _WORD = re.compile(r"""[^\s/\\'"`]+""")
 
@@ -48,7 +49,9 @@ def message(text: str) -> str:
 
     Its names, values and paths are visible, and cut where they are long.
     """
-    text = visible(_ends(text, _SEARCHED))
+    text = visible(
+        _ends(_HINTED.sub(lambda found: f"{found[1]} {found[2].upper()}", text), _SEARCHED)
+    )
     text = _QUOTED.sub(lambda found: f"{found[1]}{shorten(found[2])}{found[1]}", text)
     text = _LISTED.sub(lambda found: f"[{shorten(found[0][1:-1])}]", text)
     text = _WORD.sub(lambda found: shorten(found[0]), text)
@@ -128,6 +131,12 @@ class MissingSampleError(InputError):
     """A data file has a cell without a sample where every cell must have one."""
 
     code = "sample_missing"
+
+
+class BadCellError(MissingSampleError):
+    """A data file has a cell that is no finite number, where a sample may be missing."""
+
+    code = "input_invalid"
 
 
 class SurplusCellsError(InputError):

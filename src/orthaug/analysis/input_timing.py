@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Measure = Callable[[SegmentedMotion, FreeRunFit | None], float]
 """Size of the errors of a fit; inf without one."""
 ROWS = 4000  # at most
+_STEPS, _FEWEST_ROWS = 40_000, 500  # substeps of integration at most, and rows all the same
 _STEPPED = 0.5  # of the rows, over which a held input does not move
 _CLEARLY = 0.02  # lower, of the residual: another hold
 _LATE = 0.2  # lower: a delay; missing friction or a small lag gains less by one
@@ -124,6 +125,12 @@ def is_stepped(record: Record) -> bool:
     )
 
 
+def rows_of_trials(problem: MotionProblem) -> int:
+    """Return how many rows are tried at most: fewer where each takes many substeps."""
+    most = min(ROWS, max(_STEPS // max(problem.substeps, 1), _FEWEST_ROWS))
+    return min(most, max(map(len, problem.record.experiments)))
+
+
 def on_longest(
     problem: MotionProblem,
     criterion: Criterion,
@@ -136,7 +143,8 @@ def on_longest(
     Arguments as in `try_holds`.
     """
     longest = max(problem.record.experiments, key=len)
-    record = replace(problem.record, experiments=(longest.rows(0, ROWS),))
+    first = longest.rows(0, rows_of_trials(problem))
+    record = replace(problem.record, experiments=(first,))
     return MotionTask.of(problem.on(record), learner, criterion).prepare(solver, structure)
 
 

@@ -83,6 +83,8 @@ def check(
     check_figure(figure, *job.files, force=force)
     if job.physics.runs_in_check:
         prepare_jax()
+    if note := job.physics.slow_note(job):
+        streams.say(note)
     result = check_job(job)
     refused = job.physics.refusal(job, result)
     failure = None if refused is None else type(refused)(f"{spec}: {refused}")

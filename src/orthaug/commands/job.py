@@ -95,6 +95,10 @@ class JobPhysics(ABC, Generic[P, F]):
     map: PhysicsMap | None = None
     """The map from physical parameters to θ, where the parameters are not physical themselves."""
 
+    def slow_note(self, job: Job) -> str:
+        """Return a note where `check` takes long, with the reason; "" otherwise."""
+        return ""
+
     @classmethod
     @abstractmethod
     def declare(cls, spec: Spec, step: float | None) -> Self:

@@ -235,6 +235,17 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         """Return functions that pose a variant on a fold by the sizes of all rows, and train it."""
         return job.problem.on, self.train
 
+    def slow_note(self, job: Job) -> str:
+        from orthaug.analysis.input_timing import rows_of_trials
+
+        problem = job.problem
+        if problem.substeps < _STIFF:
+            return ""
+        return (
+            f"note: about {problem.substeps} substeps in a sample make every run slow, and the "
+            f"check makes hundreds of runs; they are over {rows_of_trials(problem)} rows."
+        )
+
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         from orthaug.analysis.absorbed import Waves
         from orthaug.analysis.imitation import imitation_before

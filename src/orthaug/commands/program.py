@@ -158,6 +158,9 @@ GROUPS = {
     "Commands on the tool": ("schema", "reproduce", "benchmark"),
 }
 """The commands as `orthaug --help` lists them: in the order of work."""
+# Words of typer's versions about an option's value
+_NO_NUMBER = re.compile(r"valid (integer|number|float)")
+_GIVEN = re.compile(r"""(?:input_value=|^)(['"])(.*?)\1""")
 _TYPE = re.compile(r" <\S+>$")  # of an argument, which its own help says in words
 _SHORT = 100  # characters of the first line of a command's help: none is cut
 
@@ -292,7 +295,7 @@ def _complaint(error: Exception) -> str | None:
 
     complaint = getattr(error, "format_message", None)  # typer's own, about arguments
     if complaint is not None:
-        return complaint()
+        return _number_complaint(error) or complaint()
     text = str(error)
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:
         return "there is not enough memory; take fewer rows, a smaller learner, or every n-th row."
@@ -300,6 +303,18 @@ def _complaint(error: Exception) -> str | None:
     if platforms not in ("", "cpu") and not starts():
         return f"JAX cannot start with JAX_PLATFORMS={platforms}; unset it, or set it to cpu."
     return None
+
+
+def _number_complaint(error: Exception) -> str | None:
+    """Return the message for an option that takes a number and was given none; None otherwise."""
+    kind = _NO_NUMBER.search(str(getattr(error, "message", "")))
+    option = next(reversed(getattr(getattr(error, "param", None), "opts", [])), None)
+    if kind is None or option is None:
+        return None
+    given = _GIVEN.search(f"{getattr(error, 'message', '')} {error.__cause__ or ''}")
+    found = f"found {show(given[2])}" if given else "found another word"
+    expected = "a whole number, such as 3" if kind[1] == "integer" else "a number, such as 0.5"
+    return f"{option}: {found}; expected {expected}."
 
 
 def _version(show: bool) -> None:

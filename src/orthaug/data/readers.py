@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type
-from orthaug._base.errors import InputError, MissingSampleError, show
+from orthaug._base.errors import BadCellError, InputError, MissingSampleError, show
 from orthaug._base.lines import plural
 from orthaug.data.channels import Channel, as_channels
 from orthaug.data.clock import DRIFT, JITTER, thinned_fault
@@ -434,7 +434,14 @@ def _check_cells(table: Table, columns: Sequence[str], start: int, stop: int) ->
             row = start + int(bad[0])
             text = table.cell(name, row)
             what = f"found '{text}'" if text else f"the cell is empty{_end_of(table, name, row)}"
-            error = MissingSampleError if text.strip().lower() in MISSING else InputError
+            word = text.strip().lower()
+            error = (
+                MissingSampleError
+                if word in MISSING
+                else InputError
+                if word in STATES
+                else BadCellError
+            )
             dated, number = name == table.dated, np.isfinite(text_number(text))
             kind = "a date" if dated else "decimals with commas" if number else ""
             wanted = f"{kind}, as in other cells" if kind else "a finite number"
@@ -456,10 +463,7 @@ def _remedy(text: str) -> str:
     """Return what to do about a cell that holds a word."""
     if text.strip().lower() in STATES:
         return " Write 0 and 1 for such words."
-    return (
-        ' Correct the cell, or empty it where its sample is missing: `missing` = "skip" '
-        "in [data] leaves such rows out."
-    )
+    return " Correct the cell, or empty it where its sample is missing."
 
 
 def _check_rising(table: Table, time: str, start: int, stop: int) -> None:

@@ -17,6 +17,7 @@ from orthaug.fitting.estimates import STD_KINDS, Estimate
 from orthaug.models.model import Model
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.motion import Motion
+from orthaug.reports.page_blocks import unbroken
 
 # Colours are the notebook's own, so that a card is read on light and on dark.
 _TEMPLATE = """<div class="orthaug" style="max-width:60em;overflow-x:auto">
@@ -65,7 +66,10 @@ class Card:
 def html_of(shown: object) -> str:
     """Return the object, or a card, as HTML, escaped."""
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        finalize=lambda shown: unbroken(shown) if isinstance(shown, str) else shown,
     )
     card = shown if isinstance(shown, Card) else card_of(shown)
     tables = [Table(t.columns, _shorten_table(t)) for t in card.tables]

@@ -21,6 +21,7 @@ _LARGE = 7  # digits before the point from which a power of ten is written
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SMALL = 1e-4  # below it a power of ten is written, as `g` does
 _ROUNDING = 1e-12  # of its scale: a smaller number is the rounding error of zero
+_PERCENT, _SIGN = re.compile(r"(?<=\d) (?=%)"), re.compile(r"−(?=[\d.])")
 _MINUS = re.compile(r"(?<![\w\])}.-])-(?=[\d.])")  # before a number of its own
 
 
@@ -88,13 +89,20 @@ def chance(p: float | None) -> str:
 
 
 def prose(text: str) -> str:
-    """Return a sentence with the minus signs of the tables.
+    r"""Return a sentence with the minus signs of the tables, whose figures no line end cuts.
 
     Examples:
         >>> prose("moves y[k-1] by -0.015, from -2 to 3")
-        'moves y[k-1] by −0.015, from −2 to 3'
+        'moves y[k-1] by −\u20600.015, from −\u20602 to 3'
+        >>> prose("5 % of it")
+        '5\xa0% of it'
     """
-    return _MINUS.sub("−", text)
+    return unbroken(_MINUS.sub("−", text))
+
+
+def unbroken(text: str) -> str:
+    """Return a text whose lines end neither between a figure and % nor behind a minus sign."""
+    return _PERCENT.sub("\xa0", _SIGN.sub("−\u2060", text))
 
 
 def regressor_label(name: str, units: Mapping[str, str]) -> str:
