@@ -213,7 +213,7 @@ def _of_motion(
     verdict = "unmodelled" if explained else "white" if white else "equation_noise"
     lacking = (lacks or several, late, coarse, slight, misread)
     text = free_run_words(verdict, fit, tests, shares, followed, curved, *lacking)
-    warnings = [restarted[1]] if restarted else []
+    warnings = [restarted[1]] if restarted and restarted[1] else []
     warnings += [*misread, *(one.warning for one in late)]
     warnings += [coarse.warning] if coarse and coarse.warning else []
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
@@ -313,7 +313,7 @@ def _of_lagged(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
     found = _conclude(seen, free_run if free_runs else None)
-    more = () if restarted is None else (restarted[1],)
+    more = (restarted[1],) if restarted and restarted[1] else ()
     more += exchanged_inputs(problem) if found.verdict == "unmodelled" else ()
     return replace(found, warnings=(*more, *found.warnings))
 
