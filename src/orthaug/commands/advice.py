@@ -231,7 +231,7 @@ def advise(
     """
     if job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
-    mending, found = mending_proposals(job, result), proposals(job, result, fit)
+    mending, found = mending_proposals(job, result, fit), proposals(job, result, fit)
     untried = [proposal for proposal in mending if proposal.untried]
     first = untried or noise_model_proposals(fit, result)
     others = None if untried else _tried(job, fit, result, mending, found)
@@ -247,6 +247,9 @@ def _tried(
     """Return the changes that lower the error in a trial, and a count; as `advise`."""
     if not mending and not found:
         return None
+    if any(warning.code == "unstable_plant" for warning in result.warnings):
+        text = "No change of the spec was tried: no free run of an unstable plant follows a record."
+        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(mending) + len(found))
     try:
         rows = ValidationRows.of(job)
     except InputError:
