@@ -25,6 +25,7 @@ from orthaug.commands.advice import (
     Trials,
     ValidationRows,
     _conclude_trials,
+    _tried,
     apply_change,
 )
 from orthaug.commands.motion import _has_term
@@ -405,6 +406,9 @@ def test_an_input_that_is_logged_late_is_advised_before_a_term_of_the_same_error
     assert [one.text[:10] for one in advice] == ["With u 1 s", "With the t"]
 
 
+_NO_FIT: Any = None
+
+
 def recorded(y: np.ndarray, section: str = "motion", known: bool = True) -> list[Proposal]:
     """What is proposed for an output so recorded, if its warnings are in the result."""
     record = oa.Record.from_arrays(np.zeros(len(y)), y)
@@ -415,7 +419,7 @@ def recorded(y: np.ndarray, section: str = "motion", known: bool = True) -> list
     )
     warnings = [one.warning for one in mendings(record)] if known else []
     result: Any = SimpleNamespace(warnings=warnings)
-    return mending_proposals(job, result)
+    return mending_proposals(job, result, _NO_FIT)
 
 
 def test_the_step_that_a_warning_names_is_a_proposal():
@@ -457,11 +461,11 @@ def test_exchanged_columns_are_the_first_advice():
         declaration={"data": {"channels": {"u": {"unit": "N"}}}},
     )
     result: Any = SimpleNamespace(warnings=[warning])
-    (found,) = mending_proposals(job, result)
+    (found,) = mending_proposals(job, result, _NO_FIT)
     assert found.words == "the columns of u and y exchanged" and found.untried
     channels = apply_change(job.declaration, found.change)["data"]["channels"]
     assert channels == {"u": {"unit": "N", "column": "y"}, "y": {"column": "u"}}
-    assert mending_proposals(job, SimpleNamespace(warnings=[])) == []  # type: ignore[arg-type]
+    assert mending_proposals(job, SimpleNamespace(warnings=[]), _NO_FIT) == []  # type: ignore[arg-type]
 
 
 def test_a_noise_model_is_the_first_advice_where_the_free_run_is_no_better():
@@ -514,6 +518,70 @@ def test_the_range_of_a_sensor_is_advised_before_terms_that_bend(tmp_path, plant
     if not plant:
         assert first is not None and first.after < 0.3 * first.before
         assert len(result.advice) == 1 and result.advice_trials.not_tried > 0
+
+
+def test_wrong_samples_are_marked_before_anything_else_is_tried(tmp_path):
+    """The warning named the step; there was no advice, and physics was said to be missing."""
+    rng, kept = np.random.default_rng(6), np.exp(-0.1 / 0.5)
+    u, x = np.repeat(rng.uniform(-1, 1, 30), 20), np.zeros(600)
+    for k in range(599):
+        x[k + 1] = kept * x[k] + (1 - kept) * 2 * u[k]
+    h = x + 0.01 * rng.normal(size=600)
+    wrong = rng.choice(600, 9, replace=False)
+    h[wrong] += 30 * rng.normal(size=9)
+    result = oa.fit_spec(str(put(tmp_path, FILLED, np.column_stack([u, h]), "u,h"))).result
+    (first,) = result.advice
+    assert first.text.startswith("With wrong samples of h marked as missing (step = ")
+    assert first.after is not None and first.before is not None and first.after < first.before
+    (step,) = first.change["data.prepare"]
+    assert step["step"] == "outliers" and step["channels"] == ["h"]
+    assert first.after < 0.1 * result.scores["train"].simulation.nrmse[0]
+
+
+def test_columns_in_another_unit_are_converted_before_terms_are_advised(tmp_path):
+    """A swing in degrees under a spec in rad: terms were advised that bend the sine."""
+    rng, x, rows = np.random.default_rng(8), np.array([0.0, 0.0]), []
+    u = np.repeat(rng.uniform(-40, 40, 30), 20)
+    for value in u:
+        rows.append(x[0])
+        for _ in range(4):
+            rate = value - 30 * np.sin(x[0]) - x[1]
+            x = x + 0.0125 * np.array([x[1], rate])
+    angle = np.degrees(np.array(rows)) + 0.1 * rng.normal(size=600)
+    text = SWING + '[data.channels]\nangle = { column = "angle [deg]", unit = "rad" }\n'
+    spec = put(tmp_path, text, np.column_stack([u, angle]), "u,angle [deg]")
+    result = oa.fit_spec(str(spec)).result
+    (first,) = result.advice
+    assert first.change == {"data.channels.angle.scale": 0.0174533}
+    assert first.text.startswith("Fit with scale = 0.0174533 of angle (data.channels).")
+    assert result.advice_trials.tried == 0
+
+
+SWING = """
+[data]
+sampling_time = 0.05
+inputs = ["u"]
+outputs = ["angle"]
+train = { files = ["run.csv"] }
+[motion.states]
+p = { derivative = "w", start = "angle" }
+w = { derivative = "b*u - g*sin(p) - d*w", start = "derivative of angle" }
+[motion.outputs]
+angle = "p"
+[motion.parameters]
+b = { initial = 1.5, min = 0 }
+g = { initial = 20, min = 0 }
+d = { initial = 2, min = 0 }
+"""
+
+
+def test_no_change_is_judged_by_free_runs_of_an_unstable_plant():
+    """From 50200 deviations to 748: that another hold 'improves' such runs says nothing."""
+    unstable: Any = SimpleNamespace(warnings=[FoundWarning("unstable_plant", "")])
+    found = _tried(_NO_FIT, _NO_FIT, unstable, [], [Proposal("another hold", {})])
+    assert found is not None and found[0] == []
+    assert found[1].tried == 0 and found[1].not_tried == 1
+    assert "no free run of an unstable plant" in found[1].text
 
 
 CRANE = """

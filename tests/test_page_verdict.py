@@ -218,6 +218,29 @@ def test_the_terminal_ends_with_the_verdict_that_the_page_begins_with():
     assert verdict.trust.startswith("Take “orthogonal”: the RMS error of its free run")
 
 
+def test_feedback_is_no_doubt_beside_a_noise_model_that_leaves_white_errors():
+    """The warning said 'consistent here', and the verdict 'which biases the estimates'."""
+    looped = [Warning("closed_loop", "")]
+    found = fit_verdict(fitted(residuals=told(), warnings=looped, noise=[object()]))
+    assert found.level == "good" and "feedback" not in found.trust
+    assert "feedback" in fit_verdict(fitted(residuals=told(), warnings=looped, noise=None)).trust
+    coloured = told().model_copy(update={"verdict": "equation_noise"})
+    left = fit_verdict(fitted(residuals=coloured, warnings=looped, noise=[object()]))
+    assert left.level == "care" and "under feedback" in left.trust
+
+
+@pytest.mark.parametrize("code", ["wild_rows", "unit_mismatch", "wrapped_angle"])
+def test_wrong_data_are_mended_before_physics_is_searched(code):
+    """A search finds terms that imitate what is wrong with the data."""
+    wrong = [Warning(code, "")]
+    for ahead in (0.8, 0.3):
+        found = fit_verdict(fitted(ahead, 0.9, residuals=told(), warnings=wrong))
+        assert found.trust.startswith("Do not use the model as it is")
+        assert found.use.startswith("Mend the data first")
+    assert "search for missing physics" in fit_verdict(fitted(0.8, 0.9)).use
+    assert "Mend" not in fit_verdict(fitted(warnings=wrong)).use
+
+
 @pytest.mark.parametrize("code", ["short_for_noise", "parameter_drift", "local_minimum"])
 def test_a_warning_that_intervals_leave_something_out_is_in_the_verdict(code):
     found = fit_verdict(fitted(warnings=[Warning(code, "")]))

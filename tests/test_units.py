@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from orthaug import Channel, Record, load_spec
-from orthaug.data.units import conversion, unit_warnings
+from orthaug.data.units import conversion, unit_faults
 from orthaug.data.wild import data_warnings
 
 SPEC = """
@@ -49,7 +49,7 @@ def test_units_that_engineers_write(given, wanted, scale, offset):
 @pytest.mark.parametrize("unit", ["raw", "filtered", "-", "", "counts!", "9", "a.u."])
 def test_text_that_is_no_unit_is_no_fault(tmp_path, unit):
     (tmp_path / "run.csv").write_text(f"u,w [{unit}]\n1,2\n")
-    assert not unit_warnings(tmp_path / "run.csv", {"w": Channel("w", "rad/s")})
+    assert not unit_faults(tmp_path / "run.csv", {"w": Channel("w", "rad/s")})
 
 
 @pytest.mark.parametrize(
@@ -79,8 +79,8 @@ def test_a_spec_that_gives_a_column_another_unit(tmp_path, header, channel, said
 def test_units_in_a_row_under_the_header(tmp_path):
     rows = "\n".join(f"{k},{k * k}" for k in range(9))
     (tmp_path / "run.csv").write_text(f"u,w\nV,km/h\n{rows}\n")
-    found = unit_warnings(tmp_path / "run.csv", {"w": Channel("w", "m/s")})
-    assert len(found) == 1 and "scale = 0.277778" in found[0].text
+    found = unit_faults(tmp_path / "run.csv", {"w": Channel("w", "m/s")})
+    assert len(found) == 1 and "scale = 0.277778" in found[0].warning.text
 
 
 @pytest.mark.parametrize(("noise", "said"), [(0.0, True), (1e-3, True), (0.05, False)])

@@ -60,17 +60,23 @@ def test_the_advice_names_a_threshold_where_the_default_marks_few():
     y[at] += np.where(np.arange(len(at)) % 6, 0.9, 40.0)
     record = oa.Record.from_arrays(u=np.zeros(1000), y=y, sampling_time=0.1)
     rows = [(0, int(row)) for row in at]
-    first = _marking(record, 0, rows)
+    first, step = _marking(record, 0, rows)
     found = re.search(r"threshold = ([\d.]+), which marks (\d+) of these rows", first)
     assert found and float(found[1]) < 4 and int(found[2]) > 15
     assert "; the default of 4 marks 11. Or" in first
+    assert step == {
+        "step": "outliers",
+        "channels": ["y"],
+        "window": 5,
+        "threshold": float(found[1]),
+    }
     marked = prepare(record, Outliers(), missing="keep")
     (experiment,) = marked.experiments
     left = [row for row in rows if np.isfinite(experiment.outputs[row[1], 0])]
-    again = _marking(marked, 0, left)
+    again = _marking(marked, 0, left)[0]
     assert again.startswith('give the step "outliers" threshold = ') and "instead of 4" in again
     hidden = [(0, row) for row in (100, 200, 300)]  # samples as all others
-    assert "does not separate them from the signal" in _marking(marked, 0, hidden)
+    assert "does not separate them from the signal" in _marking(marked, 0, hidden)[0]
 
 
 def test_heavy_tails_alone_are_none():

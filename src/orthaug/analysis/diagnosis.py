@@ -50,7 +50,7 @@ from orthaug.analysis.verdict_text import (
     words,
 )
 from orthaug.data.columns import Column
-from orthaug.data.gaps import SATURATED, saturated_outputs
+from orthaug.data.gaps import SATURATED, Mending, saturated_outputs
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
 from orthaug.data.steps import Outliers
@@ -221,12 +221,13 @@ def _of_motion(
     limits = "" if white else _at_limits(record, free_run, errors, inputs, motion.held)
     lacking = (lacks or several, late, coarse, slight, misread, limits)
     text = free_run_words(verdict, fit, tests, shares, followed, curved, *lacking)
-    warnings = [restarted[1]] if restarted else []
+    warnings = [restarted[1]] if restarted and restarted[1] else []
     warnings += [*misread, *(one.warning for one in late)]
     warnings += [coarse.warning] if coarse and coarse.warning else []
     slow = not white and not fit.model.coloured and lacks is None  # what is missing may drift
     warnings += find_drift(free_run, "innovations") if slow else []
-    warnings += wild_rows(free_run, record, free_run=not fit.model.coloured)
+    wild = wild_rows(free_run, record, free_run=not fit.model.coloured)
+    warnings += [one.warning for one in wild]
     if not white:
         given = fit.std is not None and bool(np.isfinite(fit.std).any())
         more = f" {_UNCOUNTED if given else _MOVED}" if explained else ""
@@ -375,7 +376,7 @@ def _of_lagged(
             seen, changes=_with_criterion(seen, free_run if free_runs else None, trained)
         )
     found = _conclude(seen, free_run if free_runs else None)
-    more = () if restarted is None else (restarted[1],)
+    more = (restarted[1],) if restarted and restarted[1] else ()
     more += exchanged_inputs(problem) if found.verdict == "unmodelled" else ()
     return replace(found, warnings=(*more, *found.warnings))
 
@@ -414,7 +415,7 @@ def _conclude(seen: Finding, free_run: Response | None) -> Diagnosis:
     text, warnings = words(verdict, seen)
     described = seen.fit.model.coloured or (white and complete)
     drift = () if described or free_run is None else find_drift(free_run, "auto")
-    warnings = (*wild, *drift, *warnings)
+    warnings = (*(one.warning for one in wild), *drift, *warnings)
     tested = seen.tests, seen.free_tests, seen.ratio, seen.noise
     return Diagnosis(
         verdict, text, *tested, warnings, seen.predictable, seen.changes, steps=seen.steps or None
@@ -624,8 +625,23 @@ def find_drift(response: Response, kind: str) -> tuple[Warning, ...]:
     return tuple(found)
 
 
-def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> tuple[Warning, ...]:
+def wild_row_mendings(fit: Estimate) -> list[Mending]:
+    """Return the warnings `wild_rows` of a fit that a step of preparation mends, with the step."""
+    record, motion = fit.problem.record, isinstance(fit, MotionEstimate)
+    found: list[Mending] = []
+    if not motion or fit.model.coloured:
+        found = wild_rows(fit.model.predict(record), record)
+    if not found and not fit.model.coloured:
+        run = fit.model.simulate(record)
+        better = from_trained_start(fit, run)
+        found = wild_rows(run if better is None else better[0].response, record, free_run=True)
+    return [one for one in found if one.step]
+
+
+def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> list[Mending]:
     """Return a warning for each output whose error comes mostly from a few distant rows.
+
+    With the step of preparation that marks them; without one where none does.
 
     A wrong sample is one row of a free run's error, and as many more of a one-step residual as the
     physics has lags: the former may be closer and more of them.
@@ -652,17 +668,23 @@ def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> 
         named = [record.experiments[i].where(row) for i, row in at[:_NAMED]]
         more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
         what = "error of the free run" if free_run else "one-step residual"
+        remedy, step = _marking(record, j, at)
         text = (
             f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
             f"squared {what} of {output.name}: {'; '.join(named)}{more}. Wrong "
-            f"samples among them bias θ: {_marking(record, j, at)}"
+            f"samples among them bias θ: {remedy}"
         )
-        found.append(Warning("wild_rows", text))
-    return tuple(found)
+        found.append(Mending(Warning("wild_rows", text), output.name, step))
+    return found
 
 
-def _marking(record: Record, output: int, rows: list[tuple[int, int]]) -> str:
-    """Return how to mark rows, with the threshold where the default or the spec's marks few."""
+def _marking(
+    record: Record, output: int, rows: list[tuple[int, int]]
+) -> tuple[str, dict[str, Any]]:
+    """Return how to mark rows, with the threshold where the default or the spec's marks few.
+
+    And the step that does, as a spec declares it: empty where none does.
+    """
     name = record.outputs[output].name
     done = [
         one.options
@@ -675,16 +697,20 @@ def _marking(record: Record, output: int, rows: list[tuple[int, int]]) -> str:
     marks = f"marks {best.rows} of these rows"
     marks += f" and {plural(best.others, 'other')}" if best.others else ""
     by_hand = "empty their cells in the file (`missing` in [data])"
+    adds: dict[str, Any] = {"step": "outliers", "channels": [name]}
+    sharper = adds | {"window": step.window, "threshold": best.threshold}
     if done and better:
-        return (
+        text = (
             f'give the step "outliers" threshold = {best.threshold:g} instead of '
             f"{step.threshold:g}, which {marks}. For the rest, {by_hand}."
         )
+        return text, sharper
     if done:
-        return f'the step "outliers" does not separate them from the signal, so {by_hand}.'
+        return f'the step "outliers" does not separate them from the signal, so {by_hand}.', {}
     if better:
-        return (
+        text = (
             f'mark them by step = "outliers" of data.prepare with threshold = {best.threshold:g}, '
             f"which {marks}; the default of {step.threshold:g} marks {now.rows}. Or leave them out."
         )
-    return 'mark them (step = "outliers" of data.prepare), or leave them out.'
+        return text, sharper
+    return 'mark them (step = "outliers" of data.prepare), or leave them out.', adds

@@ -29,6 +29,7 @@ from orthaug.fitting.whiteness import (
     Pieces,
     autocorrelation,
     cross_correlation,
+    excess_of_products,
     ljung_box,
     ljung_box_of,
     normality,
@@ -269,7 +270,7 @@ class RunningResidual:
     """Sums over residuals and inputs that come piece by piece."""
 
     def __init__(self, outputs: Sequence[str], inputs: Sequence[str], lags: int = LAGS) -> None:
-        n = len(outputs) + len(inputs)
+        n = 2 * len(outputs) + len(inputs)  # the squares of the residuals come last
         self.outputs, self.inputs, self.lags = tuple(outputs), tuple(inputs), lags
         self._origin: Any = None  # near the means, so that little cancels
         self._before = np.zeros((0, n))
@@ -286,8 +287,10 @@ class RunningResidual:
         if self._origin is None:
             self._origin = values.mean(axis=0)
         held = self._before[:0] if begins else self._before
-        joined = np.concatenate([held, values - self._origin])
         with np.errstate(all="ignore"):
+            values = values - self._origin
+            squares = values[:, : len(self.outputs)] ** 2
+            joined = np.concatenate([held, np.concatenate([values, squares], axis=1)])
             for lag in range(min(self.lags, len(joined) - 1) + 1):
                 first = max(len(held), lag)
                 later, earlier = joined[first:], joined[first - lag : len(joined) - lag]
@@ -326,10 +329,30 @@ class RunningResidual:
                 else None
                 for j, other in enumerate(self.inputs)
             }
-            box = ljung_box_of(acf, self._pairs[1:], n)
+            excess = self._excess(covariance, mean, i, n)
+            box = ljung_box_of(acf, self._pairs[1:], n, excess=excess)
             rms = float(np.hypot(size[i] / np.sqrt(n), centre))
             found.append(RunningTest(name, n, centre, rms, acf, quantile / np.sqrt(n), box, cross))
         return tuple(found)
+
+    def _excess(self, covariance: Any, mean: Vector, e: int, n: int) -> Vector | None:
+        """Return what uneven sizes of an output's residual make of its correlations, or None.
+
+        The square of a residual less its mean μ is `s − 2 μ e + μ²`, with s its square.
+        """
+        s, centre = len(mean) - len(self.outputs) + e, mean[e]
+        own = covariance[:, s, s] - 2 * centre * (covariance[:, s, e] + covariance[:, e, s])
+        own = own + 4 * centre**2 * covariance[:, e, e]
+        if not own[0] > 0:
+            return None
+        level = covariance[0, e, e] / n
+        sums = [
+            side[:, s] - 2 * centre * side[:, e] + self._pairs * centre**2
+            for side in (self._later, self._earlier)
+        ]
+        products = own + level * (sums[0] + sums[1]) - self._pairs * level**2
+        products = products[1:] / covariance[0, e, e] ** 2
+        return excess_of_products(own / own[0], products, self._pairs[1:], n)
 
     def _cross(self, r: Any, e: int, u: int, n: int, quantile: float) -> CrossTest:
         follows = r[:, e, u]

@@ -1,7 +1,8 @@
-"""The free run from the start that training found, where the measured one is far worse.
+"""The free run from the start that training found, where the measured one is worse.
 
 A model that remembers its start for long is scored from what the first rows give. Its training on
-the free run chose another start: what it is judged by is the run from there.
+the free run chose another start: what it is judged by is the run from there. Where that is far
+better, a warning says so.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from orthaug._base.checks import Matrix
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug.analysis.fit_findings import PartScores
 from orthaug.analysis.output_response import from_fitted_start
@@ -28,6 +29,9 @@ from orthaug.models.response import Response
 _FAR_WORSE = 3.0  # times the error of other runs
 _PIECES = 4  # of an experiment, whose runs start anew
 _BY_START = 0.5  # of the error's squares: less is left where the measured start made most
+# Of the error's squares beyond what training left: a measured start that adds as little colours
+# no test of the residual
+_COLOURLESS = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +50,13 @@ class TrainedRun:
     segment: int = 0
 
 
-def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, Warning] | None:
-    """Return the free run from the start of training, and a warning.
+def from_trained_start(
+    fit: Estimate, free_run: Response
+) -> tuple[TrainedRun, Warning | None] | None:
+    """Return the free run from the start of training, with a warning where it is far better.
 
-    None where the measured start does nearly as well for every output, or clearly better for one,
-    or where the fit was not trained on the free run.
+    None where the measured start does as well, or clearly better for an output, or where the fit
+    was not trained on the free run.
 
     Args:
         free_run: over the training data, from the measured start.
@@ -67,8 +73,10 @@ def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, W
     # Each output by itself: in a sum the noise of one hides what the start makes of another
     before, after = rms_errors(free_run), rms_errors(other.response)
     better, worse = after**2 < _BY_START * before**2, before**2 < _BY_START * after**2
-    if not better.any() or worse.any():
+    if worse.any() or not _adds(before, after):
         return None
+    if not better.any():
+        return other, None
     most = int(np.argmin(np.where(better, after, np.inf) / np.where(better, before, 1.0)))
     output = free_run.outputs[most]
     of = f"{output.name}{' [' + output.unit + ']' if output.unit else ''}"
@@ -79,6 +87,13 @@ def from_trained_start(fit: Estimate, free_run: Response) -> tuple[TrainedRun, W
         f"the better one. Judge the model by the latter, or give `simulate` {other.remedy}."
     )
     return other, Warning("noisy_start", text)
+
+
+def _adds(before: Vector, after: Vector) -> bool:
+    """Return whether errors (ny,) have more squares before than after, all outputs together."""
+    there = after > 0
+    added = (before[there] / after[there]) ** 2 - 1
+    return bool(np.any(before[~there] > 0) or (len(added) and np.mean(added) > _COLOURLESS))
 
 
 def local_minimum_of_start(
@@ -165,13 +180,6 @@ def judged_record(fit: Estimate) -> Record:
     return replace(record, experiments=tuple(pieces))
 
 
-def unstable_segment(fit: Estimate) -> int:
-    """Return after how many samples the runs of an unstable plant start anew; 0 of a stable one."""
-    if not isinstance(fit, MotionEstimate) or _begins(fit) is None:
-        return 0
-    return fit.segmented.segments.steps
-
-
 def _begins(fit: MotionEstimate) -> list[list[int]] | None:
     """Return the first rows of the segments of an unstable plant; None of a stable one."""
     segmented = fit.segmented
@@ -220,7 +228,8 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     begin = "the state that its first rows give, and the model remembers the error of that"
     remedy = "more rows to start from (--initial)"
     response = replace(free_run, trajectories=tuple(trajectories))
-    return TrainedRun(response, begin, remedy, states, unstable_segment(fit))
+    segment = 0 if begins is None else fit.segmented.segments.steps
+    return TrainedRun(response, begin, remedy, states, segment)
 
 
 def _joined(pieces: list[Run]) -> Run:

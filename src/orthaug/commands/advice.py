@@ -20,7 +20,6 @@ from orthaug._base.lines import join_words, plural
 from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
-from orthaug.analysis.trained_start import unstable_segment
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.proposals import (
     Proposal,
@@ -82,24 +81,6 @@ class ValidationRows:
             )
         training, held = held_out_blocks(job.train.record, _PIECES, job.first_row)[-1]
         return cls(training, held, 0, "rows held out", " (the last third of the training data)")
-
-    def in_segments(self, steps: int) -> ValidationRows:
-        """Return the rows with free runs that start anew: no run of an unstable plant lasts."""
-        count = len(self.held.experiments)
-        skips = self.skips if isinstance(self.skips, tuple) else (self.skips,) * count
-        pieces = [
-            one.rows(first, min(first + steps, len(one)))
-            for one, skip in zip(self.held.experiments, skips, strict=True)
-            for first in range(skip, len(one), steps)
-            if len(one) - first > steps // 2
-        ]
-        if not pieces:
-            return self
-        every = steps * self.held.sampling_time
-        where = f"{self.where}, begun anew every {every:.3g} s,"
-        return replace(
-            self, held=replace(self.held, experiments=tuple(pieces)), skips=0, where=where
-        )
 
     def prepared(self, step: Any, missing: str) -> ValidationRows:
         """Return the rows after a further step of preparation; what is `missing` as in a spec.
@@ -251,7 +232,7 @@ def advise(
     """
     if job.train.source is not None or job.spec.engine.kind not in ("auto", "memory"):
         return None
-    mending, found = mending_proposals(job, result), proposals(job, result, fit)
+    mending, found = mending_proposals(job, result, fit), proposals(job, result, fit)
     untried = [proposal for proposal in mending if proposal.untried]
     first = untried or noise_model_proposals(fit, result)
     others = None if untried else _tried(job, fit, result, mending, found)
@@ -267,12 +248,13 @@ def _tried(
     """Return the changes that lower the error in a trial, and a count; as `advise`."""
     if not mending and not found:
         return None
+    if any(warning.code == "unstable_plant" for warning in result.warnings):
+        text = "No change of the spec was tried: no free run of an unstable plant follows a record."
+        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(mending) + len(found))
     try:
         rows = ValidationRows.of(job)
     except InputError:
         return None
-    if segment := unstable_segment(fit):
-        rows = rows.in_segments(segment)
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))

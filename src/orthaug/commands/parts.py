@@ -24,7 +24,7 @@ from orthaug.data.readers import read_record
 from orthaug.data.record import Experiment, Record, same_step
 from orthaug.data.sources import witness
 from orthaug.data.tables import KNOWN, PLAIN_TEXT, guessed_encoding
-from orthaug.data.units import unit_warnings
+from orthaug.data.units import UnitFault, unit_faults
 from orthaug.reports.result import FileResult
 
 
@@ -353,12 +353,26 @@ def _other_units(
     A test in a file of the training data repeats none.
     """
     known = expand_files(path, spec.data.train.files, "train") if name != "train" else ()
+    found = _unit_faults(path, spec, [file for file in files if file not in known], columns)
+    return tuple(fault.warning for fault in found)
+
+
+def training_unit_faults(path: Path, spec: Spec) -> list[UnitFault]:
+    """Return the channels of the training data whose columns have another unit."""
+    files = expand_files(path, spec.data.train.files, "train")
+    return _unit_faults(path, spec, files, spec.data.train.columns)
+
+
+def _unit_faults(
+    path: Path, spec: Spec, files: Sequence[str], columns: Mapping[str, str]
+) -> list[UnitFault]:
+    """Return what the first file with other units in its headers shows."""
     channels = {
         columns.get(channel.name, channel.file_column): channel
         for channel in (*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs))
     }
-    found = (unit_warnings(path.parent / file, channels) for file in files if file not in known)
-    return tuple(next((warnings for warnings in found if warnings), []))
+    every = (unit_faults(path.parent / file, channels) for file in files)
+    return next((faults for faults in every if faults), [])
 
 
 def _other_step(

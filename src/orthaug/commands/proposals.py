@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.lines import join_words, plural
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
+from orthaug.analysis.diagnosis import wild_row_mendings
 from orthaug.analysis.findings import LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.commands.job import Job, declared_output
+from orthaug.commands.parts import training_unit_faults
 from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
 from orthaug.data.wild import mendings
@@ -25,6 +27,7 @@ _OTHER_NOISE = (
     "It was not tried, because it moves the parameters and their intervals more than the free run."
 )
 _OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
+_OTHER_UNIT = "It was not tried, because errors in another unit cannot be compared."
 _TERMS = 3  # suspected terms that are proposed
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
 _WIDER = 2  # times the neurons
@@ -61,19 +64,25 @@ class Proposal:
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
 
 
-def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
-    """Return the steps of preparation that warnings on the record name as their remedies.
+def mending_proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
+    """Return the changes that warnings on the record name as their remedies.
 
     What the record shows wrongly looks like missing physics, so these come before all others.
     """
     record, found = job.train.record, []
     known = {(warning.code, warning.text) for warning in result.warnings}
+    codes = {code for code, _ in known}
     motion = job.physics.section == "motion"
-    if any(warning.code == "exchanged_columns" for warning in result.warnings):
+    if "exchanged_columns" in codes:
         found += _exchange(job)
-    for mending in mendings(record) if job.train.source is None else ():
+    if "unit_mismatch" in codes:
+        found += _conversions(job)
+    in_memory = job.train.source is None
+    wrong = [one for one in mendings(record) if tuple(one.warning) in known] if in_memory else []
+    wrong += wild_row_mendings(fit) if in_memory and "wild_rows" in codes else []
+    for mending in wrong:
         name, output = mending.step["step"], mending.output
-        if tuple(mending.warning) not in known or (name == "repeats" and not motion):
+        if name == "repeats" and not motion:
             continue
         steps = [*job.declaration["data"].get("prepare", []), mending.step]
         change: dict[str, Any] = {"data.prepare": steps}
@@ -84,8 +93,13 @@ def mending_proposals(job: Job, result: FitResult) -> list[Proposal]:
             continue
         change |= {"data.missing": "keep"} if motion else {}
         ends = [f"{mending.step[key]:.6g}" for key in ("low", "high") if key in mending.step]
-        which = "repeats" if name == "repeats" else f"samples at {join_words(ends)}"
-        words = f'{which} of {output} marked as missing (step = "{name}" of data.prepare)'
+        which = {"repeats": "repeats", "outliers": "wrong samples"}.get(
+            name, f"samples at {join_words(ends)}"
+        )
+        how = f'step = "{name}" of data.prepare'
+        if "threshold" in mending.step:
+            how += f" with threshold = {mending.step['threshold']:g}"
+        words = f"{which} of {output} marked as missing ({how})"
         found.append(Proposal(words, change, step=step, mends=True))
     return found
 
@@ -102,6 +116,22 @@ def _exchange(job: Job) -> Iterator[Proposal]:
         }
         words = f"the columns of {name} and {output.name} exchanged"
         yield Proposal(words, change, untried=_OTHER_OUTPUT)
+
+
+def _conversions(job: Job) -> Iterator[Proposal]:
+    """Yield the scales and offsets by which columns have the units of their channels."""
+    change: dict[str, Any] = {}
+    words = []
+    for fault in training_unit_faults(job.path, job.spec):
+        if fault.right is not None:
+            key = f"data.channels.{fault.channel}"
+            change[f"{key}.scale"] = float(f"{fault.right.scale:.6g}")
+            words.append(f"scale = {fault.right.scale:.6g} of {fault.channel}")
+            if fault.right.offset:
+                change[f"{key}.offset"] = float(f"{fault.right.offset:.6g}")
+                words[-1] += f" and its offset = {fault.right.offset:.6g}"
+    if change:
+        yield Proposal(f"{join_words(words)} (data.channels)", change, untried=_OTHER_UNIT)
 
 
 def noise_model_proposals(fit: Estimate, result: FitResult) -> list[Proposal]:

@@ -64,8 +64,19 @@ def _registry() -> Any:
     return pint.UnitRegistry(cache_folder=None)
 
 
-def unit_warnings(path: Path, channels: dict[str, Channel]) -> list[Warning]:
-    """Return a warning for every column whose header has another unit than its channel.
+class UnitFault(NamedTuple):
+    """A channel whose unit is not that of its column, and the conversion that it lacks.
+
+    None where the units are of different kinds.
+    """
+
+    channel: str
+    warning: Warning
+    right: Conversion | None
+
+
+def unit_faults(path: Path, channels: dict[str, Channel]) -> list[UnitFault]:
+    """Return every column whose header has another unit than its channel, with a warning.
 
     A scale or an offset is taken for a deliberate conversion, or a sensor's calibration, unless it
     is the inverse of the right one.
@@ -83,9 +94,10 @@ def unit_warnings(path: Path, channels: dict[str, Channel]) -> list[Warning]:
         channel = channels.get(header) or channels.get(base)
         if channel is None or not unit or not channel.unit or _plain(unit) == _plain(channel.unit):
             continue
-        text = _fault(header, unit, channel)
+        text, right = _fault(header, unit, channel)
         if text:
-            found.append(Warning("unit_mismatch", f"{path.name}: {text}"))
+            warning = Warning("unit_mismatch", f"{path.name}: {text}")
+            found.append(UnitFault(channel.name, warning, right))
     return found
 
 
@@ -93,8 +105,11 @@ def _plain(unit: str) -> str:
     return re.sub(r"[\s*·^]", "", unit).replace("²", "2").replace("³", "3")
 
 
-def _fault(header: str, unit: str, channel: Channel) -> str:
-    """Return what is wrong with a channel's scale and offset; empty for nothing."""
+def _fault(header: str, unit: str, channel: Channel) -> tuple[str, Conversion | None]:
+    """Return what is wrong with a channel's scale and offset, and the right ones.
+
+    An empty text for nothing.
+    """
     place, untouched = f"data.channels.{channel.name}", (channel.scale, channel.offset) == (1, 0)
     says = (
         f"the header of column '{header}' has the unit {unit}, and `{place}` has the unit "
@@ -103,23 +118,20 @@ def _fault(header: str, unit: str, channel: Channel) -> str:
     try:
         right = conversion(unit, channel.unit)
     except ValueError:
-        return (
-            f"{says}, of another kind, without a `scale`. Check the column, the unit and the "
-            "conversion."
-            if untouched
-            else ""
-        )
+        text = f"{says}, of another kind, without a `scale`. Check the column, the unit and the "
+        return (f"{text}conversion." if untouched else "", None)
     if right is None or (_near(right.scale, 1.0) and right.offset == 0):
-        return ""
+        return "", None
     inverse = channel.offset == 0 and _near(abs(channel.scale), 1 / right.scale)
     if not untouched and (not inverse or _near(abs(channel.scale), right.scale)):
-        return ""
+        return "", None
     offset = f" and `offset = {right.offset:.6g}`" if right.offset else ""
     given = "no `scale`" if untouched else f"`scale = {channel.scale:.6g}`, the inverse of it"
-    return (
+    text = (
         f"{says}, with {given}. The parameters absorb such a factor, and no residual shows it. "
         f"Give `scale = {right.scale:.6g}`{offset}, or correct the unit."
     )
+    return text, right
 
 
 def _near(value: float, other: float) -> bool:

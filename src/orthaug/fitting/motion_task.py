@@ -54,6 +54,8 @@ _SHORT_ITERATIONS = 15  # over segments that are not the last
 # Steps at most by which starts follow the outputs: a descent damps no step of theirs
 _SETTLING = 25
 _LOWER = 0.98  # of the misfit: what other starts of the segments must leave
+# Of a logarithm, from its initial value: a parameter that far off may move no output any more
+_FAR = np.log(1e4)
 _STARTS = 8  # drawn, where the declared initial values lead nowhere
 _WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
 _CHEAP = 1_000_000  # operations of a pass over the record's equations
@@ -79,6 +81,7 @@ def train_motion_physics(
     if best is None:
         return segmented, None
     best = _from_settled_states(own, solver, best)
+    best = _from_lost_parameters(own, solver, best)
     spent = {"iterations": best.iterations, "seconds": best.seconds}
     segmented, best = _fine_enough(segmented, best, solver)
     point = best.end.point
@@ -103,11 +106,31 @@ def _from_settled_states(
         settled = own.objective().evaluate(theta, Start(states))
     if not settled.misfit < _LOWER * best.end.point.misfit:
         return best
-    other = descend_from(own, solver, [theta], None, settled=states)
+    return _lower_end(best, descend_from(own, solver, [theta], None, settled=states))
+
+
+def _lower_end(best: FreeRunFit, other: FreeRunFit | None) -> FreeRunFit:
+    """Return the lower of two ends, the second with what both descents spent."""
     if other is None or not other.end.point.misfit < best.end.point.misfit:
         return best
     spent = {"iterations": best.iterations + other.iterations}
     return other._replace(seconds=best.seconds + other.seconds, restarted=best.restarted, **spent)
+
+
+def _from_lost_parameters(
+    own: SegmentedMotion, solver: LevenbergMarquardt, best: FreeRunFit
+) -> FreeRunFit:
+    """Return the end of a further descent where parameters that were lost are better again.
+
+    An early step may throw a positive parameter so far towards zero, or beyond, that no output
+    depends on its logarithm any more: no descent brings it back by itself.
+    """
+    coordinates, point = own.problem.motion.coordinates, best.end.point
+    lost = np.asarray(coordinates.positive) & (np.abs(point.theta - coordinates.initial) > _FAR)
+    if not lost.any():
+        return best
+    theta = np.where(lost, coordinates.initial, point.theta)
+    return _lower_end(best, descend_from(own, solver, [theta], None))  # starts went with them
 
 
 def is_cheap(segmented: SegmentedMotion) -> bool:

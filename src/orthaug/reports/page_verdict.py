@@ -63,7 +63,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         "good": "The model is reliable",
         "care": "The model is usable with reservations",
         "bad": "Do not use the model as it is"
-        if use.startswith(_SEARCH_ONLY)
+        if use.startswith((_SEARCH_ONLY, _MEND_FIRST))
         else "Do not simulate with the model",
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
@@ -273,6 +273,13 @@ def _has_warning(result: FitResult | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
+def _is_biased_by_feedback(result: FitResult | RowResult) -> bool:
+    """Return whether feedback is in the data, and no noise model that leaves white errors."""
+    white = result.residuals is not None and result.residuals.verdict == "white"
+    described = bool(getattr(result, "noise", None)) and white
+    return _has_warning(result, "closed_loop") and not described
+
+
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
@@ -315,7 +322,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         }[result.residuals.verdict]
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
-    if _has_warning(result, "closed_loop"):
+    if _is_biased_by_feedback(result):
         yield "its data were probably recorded under feedback, " + (
             "where a noise model needs complete physics and enough orders"
             if result.noise
@@ -359,6 +366,12 @@ def _is_biased(row: ParameterResult) -> bool:
 
 
 _SEARCH_ONLY = "Use it only to search for missing physics"
+_MEND_FIRST = "Mend the data first, as the warnings say, and fit again."
+# What is wrong with data looks like missing physics, which a search would then find
+_DEFECTS = (
+    *("exchanged_columns", "held_output", "reset_output", "rows_twice", "saturated_output"),
+    *("unit_mismatch", "wild_rows", "wild_samples", "wrapped_angle"),
+)
 _UNTESTED = {
     "explains_nothing": "its free run explains nothing of an output",
     "quantised_output": "the steps of an output move its parameters",
@@ -391,6 +404,9 @@ def _use_text(result: FitResult, level: str) -> str:
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
     ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
+    useless = level == "bad" and (ahead is None or ahead > _POOR or not (known and predicts))
+    if useless and any(_has_warning(result, code) for code in _DEFECTS):
+        return _MEND_FIRST
     if level == "bad" and ahead is not None and ahead > _POOR:
         return (
             f"{_SEARCH_ONLY}: the RMS error of its one-step "
@@ -490,7 +506,7 @@ def _option(result: FitResult) -> str | None:
         )
     if _has_warning(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
-    if _has_warning(result, "closed_loop"):
+    if _is_biased_by_feedback(result):
         return (
             "data with the reference recorded and the loop simulated (`controller`), with larger "
             "motions of the reference, or without the controller"
