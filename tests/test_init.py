@@ -671,7 +671,7 @@ def test_a_free_run_that_diverges_says_so(csv, tmp_path, monkeypatch):
     roles = ("--inputs", "force [N]", "--outputs", "position_mm")
     done = run("init", csv, *roles, "--out", tmp_path / "spec.toml")
     wanted = "its free run diverges: the error is over 1e-09 times the output's standard deviation"
-    assert f"{wanted} on rows 450 to 600" in unfolded(done.out)
+    assert f"{wanted} on the test rows 450 to 600" in unfolded(done.out)
 
 
 def test_the_focus_is_left_to_the_data(tmp_path):
@@ -1073,7 +1073,7 @@ def test_the_stated_error_is_what_a_fit_gives_on_the_same_rows(tmp_path, monkeyp
         "init", "run.csv", "--inputs", "u", "--outputs", "y", "--sampling-time", 0.1
     ).out.replace("\n  ", " ")
     stated = re.search(
-        r"its error in free run is ([\d.]+) % of the output's standard deviation on rows "
+        r"its error in free run is ([\d.]+) % of the output's standard deviation on the test rows "
         r"(\d+) to (\d+), fitted to rows 0 to \2 one step ahead",
         said,
     )

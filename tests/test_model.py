@@ -363,15 +363,17 @@ def test_repr(pair):
         f"{name} = {value:.5g}" for name, value in zip("abc", model.theta, strict=True)
     )
     assert repr(model).startswith(f"Model(orthogonal, {values}, learner: MLP(hidden=(3,)")
-    assert (
-        repr(model.simulate(record)) == "Response(simulation of y1, y2, 1 experiment, 30 samples)"
-    )
+    free = model.simulate(record)
+    shown = repr(free)
+    head = "Response(simulation of y1 [m], y2, 1 experiment, 30 samples; root mean squares: y1 physics "
+    assert shown.startswith(head) and "; y2 physics " in shown
+    assert f"error {free.scores().rmse[0]:.4g} m; y2" in shown and ", learner " in shown
     assert repr(model.simulate(record).trajectories[0]) == "Trajectory(30 samples of 2 outputs)"
     assert repr(model.simulate(record).scores()).startswith("Scores(rmse = ")
-    assert (
-        repr(model.predict(record, 3))
-        == "Response(3-step prediction of y1, y2, 1 experiment, 30 samples)"
+    assert repr(model.predict(record, 3)).startswith(
+        "Response(3-step prediction of y1 [m], y2, 1 experiment, 30 samples; root mean squares: "
     )
+    assert "y1 physics " in repr(model.components(record))
     none = CASES["physics alone"]
     fit = estimate(none[0](np.random.default_rng(0), 30), none[1], learner=None)
     a, b = fit.theta

@@ -483,6 +483,20 @@ def test_modes_are_the_roots_of_the_characteristic_polynomial(model):
     assert found.growing == 0 and not stability.warnings
 
 
+@pytest.mark.parametrize(("unit", "rate"), [("1/day", "1/day"), ("1/ s", "1/s"), ("N/m", "1/s")])
+def test_modes_have_the_unit_of_the_rates_among_the_parameters(unit, rate):
+    motion = oa.Motion.from_equations(
+        [oa.State("i", "u - c*i")],
+        [oa.Output("y", "i")],
+        [oa.PhysicalParameter("c", 2.0, unit=unit)],
+        inputs=["u"],
+    )
+    model = moving(motion)
+    model = replace(model, numbers=model.numbers._replace(theta_aux=np.zeros(1)))
+    text = motion_stability(model, np.ones((5, 1)), np.zeros((5, 1))).text
+    assert f"has modes of 2 {rate} along" in text and f"real part is -2 {rate}." in text
+
+
 def _driven(rate, substeps):
     """The stability of ẇ = `rate` on a square wave of its input, with steps of 0.1 s."""
     given = [oa.PhysicalParameter("c", 1.0)]

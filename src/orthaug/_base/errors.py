@@ -136,7 +136,7 @@ class MissingSampleError(InputError):
 class BadCellError(MissingSampleError):
     """A data file has a cell that is no finite number, where a sample may be missing."""
 
-    code = "input_invalid"
+    code = "cell_invalid"
 
 
 class SurplusCellsError(InputError):

@@ -23,6 +23,7 @@ from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
+from orthaug.physics.parameters import rate_unit
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
 _POINTS = 2000  # at most
@@ -103,20 +104,21 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
     held = model.form.motion.held
     subject = "the closed loop" if held else "the motion"
     linear = "linearised closed loop" if held else "linearised motion"
-    text = f"The {linear} has {_sizes(found)} along the free run. "
+    rate = rate_unit(parameter.unit for parameter in model.form.motion.parameters)
+    text = f"The {linear} has {_sizes(found, rate)} along the free run. "
     if not found.growing:
-        return MotionStability(found, (), text + _without_growth(found))
+        return MotionStability(found, (), text + _without_growth(found, rate))
     where = ", ".join(f"{name} = {value:.4g}" for name, value in found.worst.items())
     text += (
         f"At {percent(found.growing, 3)} of its points a mode grows, by up to "
-        f"{found.rightmost:.4g} 1/s ({where}); median of the largest real part "
-        f"{found.median:.4g} 1/s."
+        f"{found.rightmost:.4g} {rate} ({where}); median of the largest real part "
+        f"{found.median:.4g} {rate}."
     )
     if found.growing <= _OFTEN:
         return MotionStability(found, (), text)
     warning = (
         f"a mode of {subject} grows at {percent(found.growing, 3)} of the points of the free run, "
-        f"by up to {found.rightmost:.4g} 1/s: small errors grow there."
+        f"by up to {found.rightmost:.4g} {rate}: small errors grow there."
     )
     driven = bool(model.form.motion.inputs)
     if driven and not held and found.median > 0:  # the plant is unstable where it mostly is
@@ -124,22 +126,22 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
     return MotionStability(found, (Warning("growing_mode", warning),), text)
 
 
-def _sizes(found: Modes) -> str:
+def _sizes(found: Modes, rate: str) -> str:
     """Return a clause on the number of integrators and the rates of the other modes."""
     count = found.integrators
     whole = f"{count} integrators" if count > 1 else "an integrator" if count else ""
     if not found.fastest:
         return f"{whole} and no other modes"
     sizes = dict.fromkeys(f"{size:.4g}" for size in (found.slowest, found.fastest))
-    return f"{whole}{' and ' if count else ''}modes of {' to '.join(sizes)} 1/s"
+    return f"{whole}{' and ' if count else ''}modes of {' to '.join(sizes)} {rate}"
 
 
-def _without_growth(found: Modes) -> str:
+def _without_growth(found: Modes, rate: str) -> str:
     count, sentences = found.integrators, []
     if found.fastest and found.rightmost < 0:
         others = "All others decay" if count else "All decay"
         sentences.append(
-            f"{others} everywhere: the largest real part is {found.rightmost:.4g} 1/s."
+            f"{others} everywhere: the largest real part is {found.rightmost:.4g} {rate}."
         )
     elif found.fastest:
         sentences.append("No mode grows, but not all decay: the largest real part is 0.")

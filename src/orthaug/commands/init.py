@@ -369,8 +369,9 @@ def _thinning(roles: Roles, whole: FirstModel, model: FirstModel) -> list[str]:
         return [f"{slow} (decimate), with which free runs of the same time are clearly better"]
     errors = [percent(float(np.mean(one.free_run)), 3) for one in (model, whole)]
     return [
-        f"{slow} (decimate), with which the error of the free run on training rows held out is "
-        f"{errors[0]} instead of {errors[1]}"
+        f"{slow} (decimate), with which the error of the free run is {errors[0]} instead of "
+        f"{errors[1]} on the last {percent(1 - FITTED)} of the training rows, fitted to those "
+        "before"
     ]
 
 
@@ -534,8 +535,8 @@ def _account(
     ):
         if seen is not None and seen != late:
             lines.append(
-                f"the spec takes {name} from lag {late} on, which runs clearly better on rows "
-                "held out"
+                f"the spec takes {name} from lag {late} on, which runs clearly better on the last "
+                f"{percent(1 - FITTED)} of the training rows, fitted to those before"
             )
     horizon = "one step ahead" if not roles.inputs else "in free run"
     names = channel_names(roles.outputs)
@@ -548,7 +549,7 @@ def _account(
         errors = model.free_run
         where = f"the last {percent(1 - FITTED)} of rows 0 to {cut}, fitted to those before"
     else:
-        where = f"rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
+        where = f"the test rows {cut} to {rows}, fitted to rows 0 to {cut} one step ahead"
     shown = ", ".join(percent(error, 3) for error in errors)
     lines.append(
         f"first physics: {physics}; its free run diverges: the error is over {_LOST:g} times the "
@@ -561,8 +562,8 @@ def _account(
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
             f"longer runs drift away, so the orders come from runs of {model.restarted} rows, each "
-            f"from measured outputs on. Their error is {shown} on the last {percent(1 - FITTED)} "
-            f"of rows 0 to {cut}"
+            f"from measured outputs on. The error of such runs is {shown} on the last "
+            f"{percent(1 - FITTED)} of the training rows"
         )
     if cut - missing > LOOKED_AT:
         lines.append(

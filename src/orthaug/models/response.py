@@ -13,6 +13,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.lines import plural
 from orthaug.data.channels import Channel
 from orthaug.data.record import instants_of
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+_FEW = 3  # outputs whose sizes are shown
 BAND = 1.959963984540054  # standard deviations: 95 % of a normal distribution
 
 
@@ -157,11 +159,27 @@ class Response:
 
     def __repr__(self) -> str:
         kind = "simulation" if self.horizon is None else f"{self.horizon}-step prediction"
-        count, names = len(self.trajectories), ", ".join(channel.name for channel in self.outputs)
-        return (
-            f"Response({kind} of {names}, {count} experiment{'s' * (count > 1)}, "
-            f"{len(self.model)} samples)"
-        )
+        head = f"{plural(len(self.trajectories), 'experiment')}, {len(self.model)} samples"
+        names = ", ".join(channel.label for channel in self.outputs)
+        sizes = "; ".join(self._sizes(i) for i in range(min(len(self.outputs), _FEW)))
+        more = "; …" if len(self.outputs) > _FEW else ""
+        return f"Response({kind} of {names}, {head}; root mean squares: {sizes}{more})"
+
+    def _sizes(self, i: int) -> str:
+        """Return the root mean squares of an output's parts, and of what is measured and missed."""
+        parts = {"physics": [t.baseline for t in self.trajectories]}
+        if any(np.nansum(np.abs(t.learner)) > 0 for t in self.trajectories):
+            parts["learner"] = [t.learner for t in self.trajectories]
+        measured = [t.measured for t in self.trajectories if t.measured is not None]
+        if len(measured) == len(self.trajectories):
+            parts |= {"measured": measured, "error": [t.errors for t in self.trajectories]}
+        sizes = []
+        for name, values in parts.items():
+            own = np.concatenate(values)[:, i]
+            own = own[np.isfinite(own)]
+            size = f"{np.sqrt(np.mean(own**2)):.4g}" if len(own) else "–"
+            sizes.append(f"{name} {size} {self.outputs[i].unit}".rstrip())
+        return f"{self.outputs[i].name} {', '.join(sizes)}"
 
     def scores(self, skip: int | tuple[int, ...] = 0) -> Scores:
         """Return scores over all experiments, without the first `skip` samples of each.

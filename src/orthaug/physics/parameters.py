@@ -7,7 +7,8 @@ it are relative.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_nam
 from orthaug.physics.baseline import Baseline, Parameter, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
+_RATE = re.compile(r"1/(ms|s|min|h|hr|hour|d|day|week|month|yr|year)")
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
 
 _SMALLEST = math.exp(-30.0)  # of p⁰: a positive parameter that is smaller is zero
@@ -48,6 +50,19 @@ _COMPLEX = SimpleNamespace(
     maximum=lambda a, b: np.where(np.real(a) >= np.real(b), a, b),
     **{name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh")},
 )
+
+
+def rate_unit(units: Iterable[str]) -> str:
+    """Return the unit of rates that parameters of these units imply: that of all that are rates.
+
+    Equations are in the time of the record, so that rates in 1/day mean that its steps are days.
+
+    Examples:
+        >>> rate_unit(["1/day", "", "1/day"]), rate_unit(["kg", "N/m"]), rate_unit(["1/h", "1/s"])
+        ('1/day', '1/s', '1/s')
+    """
+    found = {unit.replace(" ", "") for unit in units if _RATE.fullmatch(unit.replace(" ", ""))}
+    return found.pop() if len(found) == 1 else "1/s"
 
 
 @dataclass(frozen=True)

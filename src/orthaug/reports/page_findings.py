@@ -7,6 +7,7 @@ from typing import Any
 
 from orthaug._base.lines import with_unit
 from orthaug.analysis.residual_tests import ResidualTestResult
+from orthaug.physics.parameters import rate_unit
 from orthaug.reports.biases import REMOVED_BY
 from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
@@ -86,15 +87,15 @@ def stability_blocks(result: FitResult) -> list[Any]:
     if found.contraction:
         rows.append(["rate of the best norm", number(found.contraction.rate, 4)])
     if found.modes:
-        m = found.modes
+        m, rate = found.modes, rate_unit(one.unit for one in result.parameters)
         slow, fast = number(m.slowest, 3), number(m.fastest, 3)
         modes = (
-            ["modes [1/s]", f"all at {slow}"]
+            [f"modes [{rate}]", f"all at {slow}"]
             if slow == fast
-            else ["slowest and fastest mode [1/s]", f"{slow} and {fast}"]
+            else [f"slowest and fastest mode [{rate}]", f"{slow} and {fast}"]
         )
         rows += [
-            ["rightmost eigenvalue, real part [1/s]", number(m.rightmost, 4, m.fastest)],
+            [f"rightmost eigenvalue, real part [{rate}]", number(m.rightmost, 4, m.fastest)],
             modes,
             *(
                 [["integrators, which are not among these", str(m.integrators)]]

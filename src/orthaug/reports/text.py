@@ -174,7 +174,10 @@ def compare_text(result: CompareResult, verdicts: Mapping[str, Verdict]) -> str:
         lines += ["", "* chosen on the validation part"]
     if result.equal:
         best, *others = result.equal
-        lines += [f"equal to {best} within noise: {', '.join(others)}"]
+        lines += [
+            *([] if result.chosen else [""]),
+            f"equal to {best} within noise: {', '.join(others)}",
+        ]
     lines += ["", *_setting_lines(result)] if saved else []
     parts = [
         f"{row.name}: {row.residuals.text}"
