@@ -237,6 +237,10 @@ NOT_TOML = [
     ("a = 1\na = 2\n", "broken TOML: .*line 2"),
     ("a = \n", "broken TOML"),
     ("u,y\n1,2\n", "broken TOML"),
+    ("x = { start = .8 }\n", r"a digit on both sides of the point: 0\.8, not \.8\."),
+    ('note = "of .5" # 1.\na = [1, -.25]\n', r"of the point: -0\.25, not -\.25\."),
+    ("a = 10.\n", r"of the point: 10\.0, not 10\.\."),
+    ('a.b = "x"\nc = [1.5, 2\n', r"broken TOML(?!.*both sides)"),
     (b"a = '\xff\xfe'\n", "not a text file; expected TOML in UTF-8"),
     (bytes(range(256)), "broken TOML|not a text file"),
 ]

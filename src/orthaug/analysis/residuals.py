@@ -329,13 +329,13 @@ class RunningResidual:
                 else None
                 for j, other in enumerate(self.inputs)
             }
-            excess = self._excess(covariance, mean, i, n)
+            excess = self._excess(acf, covariance, mean, i, n)
             box = ljung_box_of(acf, self._pairs[1:], n, excess=excess)
             rms = float(np.hypot(size[i] / np.sqrt(n), centre))
             found.append(RunningTest(name, n, centre, rms, acf, quantile / np.sqrt(n), box, cross))
         return tuple(found)
 
-    def _excess(self, covariance: Any, mean: Vector, e: int, n: int) -> Vector | None:
+    def _excess(self, acf: Vector, covariance: Any, mean: Vector, e: int, n: int) -> Vector | None:
         """Return what uneven sizes of an output's residual make of its correlations, or None.
 
         The square of a residual less its mean μ is `s − 2 μ e + μ²`, with s its square.
@@ -352,7 +352,7 @@ class RunningResidual:
         ]
         products = own + level * (sums[0] + sums[1]) - self._pairs * level**2
         products = products[1:] / covariance[0, e, e] ** 2
-        return excess_of_products(own / own[0], products, self._pairs[1:], n)
+        return excess_of_products(acf, own / own[0], products, self._pairs[1:], n)
 
     def _cross(self, r: Any, e: int, u: int, n: int, quantile: float) -> CrossTest:
         follows = r[:, e, u]

@@ -7,6 +7,7 @@ what was expected.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -69,6 +70,8 @@ Regularization = (
     Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 )
 
+# A number as engineers write it: TOML wants a digit on both sides of its point
+_BARE_POINT = re.compile(r"(?<=[=\[,\s])[+-]?(?:\.\d+|\d+\.(?!\d))(?=[\s,}\]eE]|$)")
 _SECTIONS = {  # of keys that are not in [training]
     "learner": "learner",
     "states": "learner.states",
@@ -593,6 +596,19 @@ def _refuse_data(path: Path) -> None:
         )
 
 
+def _bare_point(text: str) -> str:
+    """Return a sentence on the first number that begins or ends with its point; empty for none."""
+    for line in text.splitlines():
+        found = _BARE_POINT.search(re.sub(r"\"[^\"]*\"|'[^']*'|#.*", "", line))
+        if found is not None:
+            whole = re.sub(r"^([+-]?)\.", r"\g<1>0.", found[0])
+            whole += "0" * whole.endswith(".")
+            return (
+                f" TOML numbers have a digit on both sides of the point: {whole}, not {found[0]}."
+            )
+    return ""
+
+
 def load_spec(path: Path) -> Spec:
     """Read and check a spec file.
 
@@ -600,11 +616,15 @@ def load_spec(path: Path) -> Spec:
         InputError: no such file, broken TOML, unknown or missing keys, or values of the wrong kind.
     """
     check_readable(path)
+    text = ""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        text = path.read_text(encoding="utf-8-sig")
+        content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         _refuse_data(path)
-        raise SpecError(f"{path}: broken TOML: {' '.join(str(error).split())}.") from None
+        raise SpecError(
+            f"{path}: broken TOML: {' '.join(str(error).split())}.{_bare_point(text)}"
+        ) from None
     except UnicodeDecodeError:
         _refuse_data(path)
         raise SpecError(f"{path}: not a text file; expected TOML in UTF-8.") from None

@@ -123,9 +123,9 @@ def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | Non
     that.
 
     White errors of uneven size, such as those of a sensor in per cent of its reading, have larger
-    correlations by chance. Where the same test of e² rejects at 3 %, each r_e(τ)² is divided by
-    `c_τ = mean e_k² e_{k−τ}² / (mean e_k²)²` (Lobato, Nankervis and Savin 2001), which is 1 of
-    errors of equal size.
+    correlations by chance. Where e² remembers itself by more than the colour of e gives, at 3 %,
+    each r_e(τ)² is divided by `c_τ = mean e_k² e_{k−τ}² / (mean e_k²)²`, which is 1 of white errors
+    of equal size (Lobato, Nankervis and Savin 2001).
     """
     lengths = np.array([len(one) for one in pieces_of(signal)])
     n = int(lengths.sum())
@@ -133,10 +133,10 @@ def ljung_box(signal: Pieces, lags: int = 25, fitted: int = 0) -> LjungBox | Non
     if acf is None or len(acf) < 2:
         return None
     pairs = np.maximum(lengths[:, None] - np.arange(1, len(acf)), 0).sum(axis=0)
-    return ljung_box_of(acf, pairs, n, fitted, _excess_of(signal, pairs, n))
+    return ljung_box_of(acf, pairs, n, fitted, _excess_of(signal, acf, pairs, n))
 
 
-def _excess_of(signal: Pieces, pairs: Vector, n: int) -> Vector | None:
+def _excess_of(signal: Pieces, own: Vector, pairs: Vector, n: int) -> Vector | None:
     """Return `excess_of_products` of a signal; None also of one that does not move."""
     e = standardise(signal)
     squares = None if e is None else [one**2 for one in e]
@@ -145,18 +145,25 @@ def _excess_of(signal: Pieces, pairs: Vector, n: int) -> Vector | None:
         return None
     reach = len(pairs)
     products = np.sum([_products(one, one, reach)[reach + 1 :] for one in squares], axis=0)
-    return excess_of_products(acf, products, pairs, n)
+    return excess_of_products(own, acf, products, pairs, n)
 
 
-def excess_of_products(acf: Vector, products: Vector, pairs: Vector, n: int) -> Vector | None:
+def excess_of_products(
+    own: Vector, acf: Vector, products: Vector, pairs: Vector, n: int
+) -> Vector | None:
     """Return c_τ, τ = 1…M, of `ljung_box`; None where large errors do not surely go together.
 
+    The squares of normal errors have the correlations r_e(τ)² of their colour, which scatter by
+    Bartlett's formula.
+
     Args:
-        acf: of the errors' squares (M + 1,).
+        own: autocorrelation of the errors (M + 1,).
+        acf: of their squares (M + 1,).
         products: Σ e_k² e_{k−τ}² (M,) of errors with Σ e_k² = 1, less their mean.
         pairs: as in `ljung_box_of`.
     """
-    if ljung_box_of(acf, pairs, n).p >= _UNEVEN:
+    scatter = 1 + 2 * np.sum(own[1:] ** 4)
+    if ljung_box_of((acf - own**2) / np.sqrt(scatter), pairs, n).p >= _UNEVEN:
         return None
     excess = n**2 * products / np.maximum(pairs, 1)
     return np.where(excess > 0, excess, 1.0)
