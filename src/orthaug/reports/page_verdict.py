@@ -325,7 +325,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if _is_biased_by_feedback(result):
         yield "its data were probably recorded under feedback, " + (
             "where a noise model needs complete physics and enough orders"
-            if result.noise
+            if getattr(result, "noise", None)
             else "which biases the estimates"
         )
     worse = _worse(result.scores)
