@@ -333,6 +333,8 @@ def _is_likely(linearization: LearnedLinearization, kind: str, on: str) -> bool:
     """Return whether a kind suits a variable: friction needs both signs, a root a positive one."""
     if kind not in (*ODD_JUMPS, *SMOOTH_FRICTION, "square_root"):
         return True
+    if kind in SMOOTH_FRICTION and "*" in on:  # a product is no velocity
+        return False
     values = _values(linearization, on)
     return bool(np.isfinite(values).all()) and (
         is_level if kind == "square_root" else changes_sign
