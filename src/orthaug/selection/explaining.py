@@ -171,6 +171,8 @@ class Candidate:
     width: float | None
     place: int
     text: str
+    declared: bool = False
+    """True of a suspect of the user's: its width, if it has one, is not sought."""
 
     def wide(self, width: float) -> Candidate:
         """Return the candidate with another width, of four digits."""
@@ -186,9 +188,10 @@ class Candidate:
     def complexity(self) -> int:
         """Complexity of the term: of terms that explain as much the simplest is taken.
 
-        A learner is smooth: clipping imitates jumps last.
+        A learner is smooth: clipping imitates jumps last. What was expected comes before its like.
         """
-        return _COMPLEXITY.get(self.kind, 2 + self.text.replace("**", "").count("*"))
+        products = 2 + self.text.replace("**", "").count("*")
+        return _COMPLEXITY.get(self.kind, products) - self.declared
 
     @property
     def identity(self) -> tuple[str, str, int]:
@@ -315,7 +318,7 @@ def candidates_of(
     wide = [(kind, on, width) for kind, on in wide for width in _grid(linearization, on)]
     places = range(len(linearization.places))
     _check_count(linearization.seen, degree, (len(texts) + len(wide)) * len(places))
-    found = [Candidate(TERM, None, None, place, text) for text, place in suspects]
+    found = [Candidate(TERM, None, None, place, text, declared=True) for text, place in suspects]
     for place in places:
         found += [
             Candidate(kind, on, None, place, _expression_text(kind, on)) for kind, on in plain
