@@ -11,7 +11,7 @@ import scipy.signal
 from test_cli import run
 
 import orthaug as oa
-from orthaug.analysis.diagnosis import _marking
+from orthaug.analysis.wild_rows import _marking
 from orthaug.data import Outliers, prepare
 
 pytestmark = pytest.mark.usefixtures("without_figures")

@@ -23,7 +23,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, check_type, positive
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import join_words, percent, plural
+from orthaug._base.lines import join_words, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
 from orthaug.analysis.exchanged_inputs import exchanged_inputs, misread_inputs
@@ -49,12 +49,11 @@ from orthaug.analysis.verdict_text import (
     free_run_words,
     words,
 )
+from orthaug.analysis.wild_rows import wild_rows
 from orthaug.data.columns import Column
-from orthaug.data.gaps import SATURATED, Mending, saturated_outputs
+from orthaug.data.gaps import SATURATED, saturated_outputs
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
-from orthaug.data.steps import Outliers
-from orthaug.data.wild import marked_by
 from orthaug.fitting.criteria import Simulation
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import estimate
@@ -76,16 +75,8 @@ _SMALL = 0.05  # of the residual's variance: what could be predicted below that 
 _SLIGHT = 0.01  # of it, by one missing term: less is not worth naming
 _SMALL_SIZE = 0.05  # of the output's deviation, beside it
 _SMALL_COLOUR = 0.2  # the same of what a free run's own past explains: more is hardly noise
-_HOLD = 0.5  # share of the squares in wild rows
-# Share of the rows that these are at most, and the number that is always few
-_FEW, _LEAST = (0.005, 6)
-_MARKS_MORE = 1.5  # times what the present threshold marks, from which on another one is advised
-_WILD = 20.0  # robust deviations; a normal residual reaches five
-_WILD_IN_RUN, _FEW_IN_RUN = 10.0, 0.02  # the same of a free run, whose lags do not repeat a row
-_MAD = 1.4826
 _DRIFTS = 0.5  # of the variance of a free run's error: a straight line
 _LINE = 50  # rows, from which on a straight line is one
-_NAMED = 3
 _LEVEL = 0.01  # of the test of missing terms
 # Of the output's deviation: a free run that leaves less has no dead time to look for
 _SIZABLE = 0.02
@@ -623,94 +614,3 @@ def find_drift(response: Response, kind: str) -> tuple[Warning, ...]:
             )
             found.append(Warning("drift", text))
     return tuple(found)
-
-
-def wild_row_mendings(fit: Estimate) -> list[Mending]:
-    """Return the warnings `wild_rows` of a fit that a step of preparation mends, with the step."""
-    record, motion = fit.problem.record, isinstance(fit, MotionEstimate)
-    found: list[Mending] = []
-    if not motion or fit.model.coloured:
-        found = wild_rows(fit.model.predict(record), record)
-    if not found and not fit.model.coloured:
-        run = fit.model.simulate(record)
-        better = from_trained_start(fit, run)
-        found = wild_rows(run if better is None else better[0].response, record, free_run=True)
-    return [one for one in found if one.step]
-
-
-def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> list[Mending]:
-    """Return a warning for each output whose error comes mostly from a few distant rows.
-
-    With the step of preparation that marks them; without one where none does.
-
-    A wrong sample is one row of a free run's error, and as many more of a one-step residual as the
-    physics has lags: the former may be closer and more of them.
-    """
-    found = []
-    errors = errors_of(response)
-    starts = [t.start for t in response.trajectories]
-    rows = [(i, starts[i] + k) for i, error in enumerate(errors) for k in range(len(error))]
-    distance, few = (_WILD_IN_RUN, _FEW_IN_RUN) if free_run else (_WILD, _FEW)
-    for j, output in enumerate(response.outputs):
-        error = np.concatenate(errors)[:, j]
-        error = np.where(np.isnan(error), np.nanmedian(error), error)
-        size = np.abs(error - np.median(error))
-        wild = np.flatnonzero(size > distance * _MAD * np.median(size))
-        held = float(np.sum(size[wild] ** 2)) / max(float(np.sum(size**2)), 1e-300)
-        if (
-            not len(wild)
-            or len(wild) > max(_LEAST, few * len(error))
-            or held < _HOLD
-            or not np.median(size)
-        ):
-            continue
-        at = [rows[k] for k in wild]
-        named = [record.experiments[i].where(row) for i, row in at[:_NAMED]]
-        more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
-        what = "error of the free run" if free_run else "one-step residual"
-        remedy, step = _marking(record, j, at)
-        text = (
-            f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
-            f"squared {what} of {output.name}: {'; '.join(named)}{more}. Wrong "
-            f"samples among them bias θ: {remedy}"
-        )
-        found.append(Mending(Warning("wild_rows", text), output.name, step))
-    return found
-
-
-def _marking(
-    record: Record, output: int, rows: list[tuple[int, int]]
-) -> tuple[str, dict[str, Any]]:
-    """Return how to mark rows, with the threshold where the default or the spec's marks few.
-
-    And the step that does, as a spec declares it: empty where none does.
-    """
-    name = record.outputs[output].name
-    done = [
-        one.options
-        for one in record.prepared
-        if one.step == "outliers" and name in one.options.get("channels", [name])
-    ]
-    step = Outliers(**{key: done[-1][key] for key in ("window", "threshold")} if done else {})
-    now, best = marked_by(record, output, rows, step)
-    better = best.gain > _MARKS_MORE * max(now.gain, 0)
-    marks = f"marks {best.rows} of these rows"
-    marks += f" and {plural(best.others, 'other')}" if best.others else ""
-    by_hand = "empty their cells in the file (`missing` in [data])"
-    adds: dict[str, Any] = {"step": "outliers", "channels": [name]}
-    sharper = adds | {"window": step.window, "threshold": best.threshold}
-    if done and better:
-        text = (
-            f'give the step "outliers" threshold = {best.threshold:g} instead of '
-            f"{step.threshold:g}, which {marks}. For the rest, {by_hand}."
-        )
-        return text, sharper
-    if done:
-        return f'the step "outliers" does not separate them from the signal, so {by_hand}.', {}
-    if better:
-        text = (
-            f'mark them by step = "outliers" of data.prepare with threshold = {best.threshold:g}, '
-            f"which {marks}; the default of {step.threshold:g} marks {now.rows}. Or leave them out."
-        )
-        return text, sharper
-    return 'mark them (step = "outliers" of data.prepare), or leave them out.', adds

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.lines import join_words, plural
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
-from orthaug.analysis.diagnosis import wild_row_mendings
 from orthaug.analysis.findings import LateInputResult
 from orthaug.analysis.input_timing import is_stepped
+from orthaug.analysis.wild_rows import wild_row_mendings
 from orthaug.commands.job import Job, declared_output
 from orthaug.commands.parts import training_unit_faults
 from orthaug.data.preparation import STEPS
