@@ -1,7 +1,9 @@
-"""Distant rows of a fit's errors: wrong samples, and the step of preparation that marks them."""
+"""Wrong samples: distant rows of errors, the step that marks them, and a fit without them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,13 @@ from orthaug.analysis.residuals import errors_of
 from orthaug.analysis.trained_start import from_trained_start
 from orthaug.data.gaps import Mending
 from orthaug.data.record import Record
+from orthaug.data.regressors import stack_rows
 from orthaug.data.steps import Outliers
-from orthaug.data.wild import marked_by
+from orthaug.data.wild import WildSample, marked_by
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.response import Response
+from orthaug.physics.problem import Problem
 
 _HOLD = 0.5  # share of the squares in wild rows
 # Share of the rows that these are at most, and the number that is always few
@@ -26,6 +30,9 @@ _WILD = 20.0  # robust deviations; a normal residual reaches five
 _WILD_IN_RUN, _FEW_IN_RUN = 10.0, 0.02  # the same of a free run, whose lags do not repeat a row
 _MAD = 1.4826
 _NAMED = 3
+_FEWEST = 3  # rows for each parameter
+_SHOWN = 4  # parameters
+_MOVED = 0.01  # of a value: less is none
 
 
 def wild_row_mendings(fit: Estimate) -> list[Mending]:
@@ -117,3 +124,43 @@ def _marking(
         )
         return text, sharper
     return 'mark them (step = "outliers" of data.prepare), or leave them out.', adds
+
+
+def fit_without(problem: Problem, samples: Sequence[WildSample]) -> str:
+    """Return a clause on the parameters that move where the rows of these samples are left out.
+
+    They are those of physics without a learner.
+    """
+    record, names = problem.record, problem.baseline.names
+    marked = []
+    for i, experiment in enumerate(record.experiments):
+        inputs, outputs = np.zeros_like(experiment.inputs), np.zeros_like(experiment.outputs)
+        for sample in samples:
+            if sample.experiment == i:
+                target, column = (
+                    (inputs, sample.column)
+                    if sample.column < len(record.inputs)
+                    else (outputs, sample.column - len(record.inputs))
+                )
+                target[sample.row, column] = 1.0
+        marked.append(replace(experiment, inputs=inputs, outputs=outputs))
+    rows = stack_rows(replace(record, experiments=tuple(marked)), problem.layout)
+    kept = ~((rows.x != 0).any(axis=1) | (rows.y != 0).any(axis=1))
+    if len(kept) != problem.count or kept.all() or kept.sum() < _FEWEST * len(names) or not names:
+        return ""
+    phi = problem.baseline.on(problem.rows.x, problem.layout, problem.outputs)[0][kept].reshape(
+        -1, len(names)
+    )
+    size = np.linalg.norm(phi, axis=0)
+    if not np.all(size > 0):
+        return ""
+    there = np.linalg.lstsq(phi / size, problem.target[kept].reshape(-1), rcond=None)[0] / size
+    pairs = zip(names, problem.least_squares, there, strict=True)
+    moved = [
+        f"{n} = {b:.4g} instead of {a:.4g}"
+        for n, a, b in pairs
+        if abs(a - b) > _MOVED * max(abs(a), abs(b))
+    ]
+    if not moved:
+        return "Physics alone gives the same without it."
+    return f"Without it physics alone gives {', '.join(moved[:_SHOWN])}."

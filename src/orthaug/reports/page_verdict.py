@@ -276,8 +276,12 @@ def _has_warning(result: FitResult | RowResult, code: str) -> bool:
 def _is_biased_by_feedback(result: FitResult | RowResult) -> bool:
     """Return whether feedback is in the data, and no noise model that leaves white errors."""
     white = result.residuals is not None and result.residuals.verdict == "white"
-    described = bool(getattr(result, "noise", None)) and white
-    return _has_warning(result, "closed_loop") and not described
+    return _has_warning(result, "closed_loop") and not (_has_noise_model(result) and white)
+
+
+def _has_noise_model(result: FitResult | RowResult) -> bool:
+    """Return whether the noise was modelled; rows of a comparison do not say."""
+    return bool(getattr(result, "noise", None))
 
 
 def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
@@ -325,7 +329,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     if _is_biased_by_feedback(result):
         yield "its data were probably recorded under feedback, " + (
             "where a noise model needs complete physics and enough orders"
-            if getattr(result, "noise", None)
+            if _has_noise_model(result)
             else "which biases the estimates"
         )
     worse = _worse(result.scores)
@@ -414,7 +418,7 @@ def _use_text(result: FitResult, level: str) -> str:
             "too."
         )
     # A noise model is there to predict; without one any slow output is predicted well by its past
-    if level == "bad" and not (predicts and (known or result.noise)):
+    if level == "bad" and not (predicts and (known or _has_noise_model(result))):
         return f"{_SEARCH_ONLY}."
     if level == "bad" or _has_warning(result, _UNSTABLE):
         text = "predict the next sample"
