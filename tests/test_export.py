@@ -246,11 +246,11 @@ class Case:
 
 
 @cache
-def case(name: str) -> Case:
-    """A model with what it says itself."""
+def case(name: str, steps: int = STEPS) -> Case:
+    """A model with what it says itself, with a free run of so many steps."""
     model, rng = MODELS[name](), np.random.default_rng(0)
     state = rng.normal(size=(POINTS, len(model.state_names)))
-    inputs = rng.normal(size=(STEPS, len(model.step_inputs)))
+    inputs = rng.normal(size=(steps, len(model.step_inputs)))
     stepped = jax.jit(jax.vmap(model.step))(state, inputs[:POINTS])
     free = jax.jit(lambda s, u: jax.lax.scan(model.step, s, u)[1])(np.zeros(state.shape[1]), inputs)
     assert np.isfinite(free).all() and np.ptp(free) > 0.01
@@ -285,7 +285,7 @@ def run_casadi(folder: Path, given: Case):
     following, y = (
         np.array(part).T for part in step.map(POINTS)(given.state.T, given.inputs[:POINTS].T)
     )
-    free = step.mapaccum(STEPS)(np.zeros(given.state.shape[1]), given.inputs.T)[1]
+    free = step.mapaccum(len(given.inputs))(np.zeros(given.state.shape[1]), given.inputs.T)[1]
     yield "float64", (following, y, np.array(free).T)
 
 
@@ -295,7 +295,7 @@ def run_control(folder: Path, given: Case):
     plant = imported(folder / "plant.py").system()
     rows = list(zip(given.state, given.inputs, strict=False))
     single = [np.array([ask(0.0, s, u) for s, u in rows]) for ask in (plant.dynamics, plant.output)]
-    time = 0.1 * np.arange(STEPS)
+    time = 0.1 * np.arange(len(given.inputs))
     free = control.input_output_response(
         plant, time, given.inputs.T, np.zeros(given.state.shape[1]), squeeze=False
     )
@@ -329,7 +329,7 @@ def run_fmu(folder: Path, given: Case):
         fmu.doStep(currentCommunicationPoint=0.1 * k, communicationStepSize=0.1)
         return y
 
-    free = np.array([step(k) for k in range(STEPS)])
+    free = np.array([step(k) for k in range(len(given.inputs))])
     following, y = [], []
     for k, state in enumerate(given.state):
         fmu.setReal(by["local"], state.tolist())
@@ -399,7 +399,10 @@ def run_library(library, given: Case, dtype: np.dtype):
     """Steps and the free run by a shared library; a state is its numbers, then the flag."""
     n, ny = given.state.shape[1], given.free.shape[1]
     state = np.zeros(1, np.dtype([("x", dtype, n), ("flag", np.intc)], align=True))
-    inputs, y = np.ascontiguousarray(given.inputs, dtype=dtype), np.zeros((STEPS, ny), dtype=dtype)
+    inputs, y = (
+        np.ascontiguousarray(given.inputs, dtype=dtype),
+        np.zeros((len(given.inputs), ny), dtype=dtype),
+    )
 
     def at(array: np.ndarray) -> ctypes.c_void_p:
         return ctypes.c_void_p(array.ctypes.data)
@@ -412,7 +415,7 @@ def run_library(library, given: Case, dtype: np.dtype):
     single = np.array(following), y[:POINTS].copy()
     library.plant_start(at(state))
     library.plant_run.restype = ctypes.c_size_t
-    assert library.plant_run(at(state), at(inputs), at(y), ctypes.c_size_t(STEPS)) == 0
+    assert library.plant_run(at(state), at(inputs), at(y), ctypes.c_size_t(len(inputs))) == 0
     run = y.copy()
     flagged_steps(library.plant_step, state, inputs[:1].copy(), y, at)
     return *single, run
@@ -468,6 +471,29 @@ def test_an_export_computes_what_the_model_computes(tmp_path, name, target):
         near(following, given.stepped[0], relative)
         near(y, given.stepped[1], relative)
         near(free, given.free, relative)
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("target", ["casadi", "fmu"])
+@pytest.mark.parametrize("name", [name for name in MODELS if name.startswith("motion")])
+def test_a_motion_runs_for_ten_thousand_steps_elsewhere(tmp_path, name, target):
+    pytest.importorskip(*NEEDED[target])
+    given = case(name, 10_000)
+    oa.export(given.model, tmp_path / target, target, name="plant")
+    ((_, (_, _, free)),) = RUNS[target](tmp_path / target, given)
+    near(free, given.free, 1e-9)
+
+
+@pytest.mark.proof
+def test_python_control_linearizes_the_model_as_it_does_itself(tmp_path):
+    control = pytest.importorskip("control")
+    given = case("network")
+    oa.export(given.model, tmp_path, "control", name="plant", force=True)
+    x, u = 0.1 * given.state[0], 0.1 * given.inputs[0]
+    found = control.linearize(imported(tmp_path / "plant.py").system(), x, u, eps=1e-6)
+    (a, b), (c, d) = jax.jacobian(given.model.step, argnums=(0, 1))(x, u)
+    for by_control, own in zip((found.A, found.B, found.C, found.D), (a, b, c, d), strict=True):
+        np.testing.assert_allclose(by_control, own, atol=1e-5 * (1 + np.abs(own).max()))
 
 
 @pytest.mark.parametrize("name", MODELS)
