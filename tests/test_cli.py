@@ -861,6 +861,14 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
         {"": ("skip = 5", 'columns = { z = "y" }')},
         ["plant.toml", "data.tests.steps.columns", "'z' is neither an input nor an output"],
     ),
+    "lists of columns of different lengths": (
+        {"": ("skip = 5", 'columns = { u = ["u", "u"], y = ["y"] }')},
+        ["data.tests.steps", "u has 2, y has 1", "one column for all"],
+    ),
+    "an empty list of columns": (
+        {"": ("skip = 5", "columns = { u = [] }")},
+        ["data.tests.steps", "a list of `columns` is empty"],
+    ),
 }
 
 

@@ -9,6 +9,7 @@ from typing import get_args
 import pytest
 
 from orthaug import Channel, InputError, Lags, Parameter, Term
+from orthaug.commands.parts import load_parts
 from orthaug.commands.spec import load_spec
 from orthaug.models.learners import ACTIVATIONS
 
@@ -600,3 +601,32 @@ def test_long_keys_and_values_are_cut(tmp_path):
 def test_rows_are_whole_numbers(tmp_path, value):
     with pytest.raises(InputError, match="data.tests.steps.rows"):
         load_spec(put(tmp_path, edited(FULL, "rows = [0, 9000]", f"rows = {value}")))
+
+
+def test_realisations_beside_each_other_in_a_file_are_experiments(tmp_path):
+    rows = ["u1,u2,u3,y1,y2", *(f"{k},{10 * k},{100 * k},{k + 0.5},{k + 0.25}" for k in range(30))]
+    (tmp_path / "runs.csv").write_text("\n".join(rows))
+    spec = put(
+        tmp_path,
+        """
+[data]
+sampling_time = 0.1
+inputs = ["u", "v"]
+outputs = ["y"]
+[data.train]
+files = ["runs.csv"]
+rows = [[0, 10], [10, 30]]
+columns = { u = ["u1", "u2"], v = "u3", y = ["y1", "y2"] }
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+""",
+    )
+    train = load_parts(spec, load_spec(spec))[0]
+    record = train.record
+    assert [len(e.outputs) for e in record.experiments] == [10, 20, 10, 20]
+    first, _, _, last = record.experiments
+    assert (first.inputs[3] == [3, 300]).all() and first.outputs[3, 0] == 3.5
+    assert (last.inputs[3] == [130, 1300]).all() and last.outputs[3, 0] == 13.25
+    assert {e.source for e in record.experiments} == {"runs.csv"}
+    assert [(file.file, file.rows) for file in train.files] == [("runs.csv", 60)]

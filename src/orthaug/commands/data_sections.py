@@ -52,14 +52,54 @@ Range = Annotated[list[Count], Field(min_length=2, max_length=2)]
 Text = Annotated[str, Field(min_length=1)]
 
 
+def column_sets(columns: Mapping[str, str | list[str]]) -> list[dict[str, str]]:
+    """Return the columns of each experiment that a file has beside each other, by channel.
+
+    A channel with one column has it in all of them.
+
+    Raises:
+        ValueError: lists of different lengths, or empty ones.
+
+    Examples:
+        >>> column_sets({"u": "force", "y": ["first", "second"]})
+        [{'u': 'force', 'y': 'first'}, {'u': 'force', 'y': 'second'}]
+    """
+    lengths = {name: len(given) for name, given in columns.items() if not isinstance(given, str)}
+    if len(set(lengths.values())) > 1:
+        named = ", ".join(f"{name} has {count}" for name, count in lengths.items())
+        raise ValueError(
+            f"`columns` lists different numbers of experiments: {named}. Give each list as many "
+            "columns, or one column for all"
+        )
+    if 0 in lengths.values():
+        raise ValueError("a list of `columns` is empty")
+    return [
+        {name: given if isinstance(given, str) else given[i] for name, given in columns.items()}
+        for i in range(next(iter(lengths.values()), 1))
+    ]
+
+
 class PartSection(Section):
-    """Files of training or test data; each file, and each row range, is an experiment."""
+    """Files of training or test data.
+
+    Each file is an experiment, and each range of rows, and each set of columns beside each other.
+    """
 
     files: Annotated[list[str], Field(min_length=1)]
     rows: Range | Annotated[list[Range], Field(min_length=1)] | None = None
     every: Positive = 1
     skip: Count = 0
-    columns: dict[str, str] = {}
+    columns: dict[str, str | list[str]] = {}
+
+    @property
+    def column_sets(self) -> list[dict[str, str]]:
+        """The columns of each experiment that a file has beside each other, by channel."""
+        return column_sets(self.columns)
+
+    @model_validator(mode="after")
+    def _sets_of_one_length(self) -> PartSection:
+        column_sets(self.columns)
+        return self
 
     @model_validator(mode="before")
     @classmethod

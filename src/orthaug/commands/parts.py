@@ -208,26 +208,31 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
     if stays and all(Path(file).suffix.lower() == ".parquet" for file in files):
         return _open_in_files(path, spec, part, name, files)
     records, results = [], []
-    used = _used_columns(spec, part.columns)
+    sets = part.column_sets
+    used = _used_columns(spec, sets)
     for file in files:
         fault = thinned_fault(path.parent / file, spec.data.sampling_time, part.every, used)
         if fault:
             raise InputError(f"{path}: data.{name}: {fault}")
         try:
-            record = read_record(
-                path.parent / file,
-                **_options(spec, part),
-                rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
-                every=part.every,
-                prepare=spec.data.steps,
-                uneven=spec.declared_physics.takes_uneven_rows,
-            )
+            beside = [
+                read_record(
+                    path.parent / file,
+                    **_options(spec, columns),
+                    rows=part.rows,  # type: ignore[arg-type]  (lists of two, checked by the spec)
+                    every=part.every,
+                    prepare=spec.data.steps,
+                    uneven=spec.declared_physics.takes_uneven_rows,
+                )
+                for columns in sets
+            ]
         except MissingSampleError as error:
             if spec.data.steps:  # whose message has the remedy
                 raise
             keep = ', "keep" runs a motion through missing outputs' if spec.motion else ""
             remedy = f'`missing = "skip"` in [data] leaves such rows out{keep}.'
             raise MissingSampleError(f"{error} {remedy}") from None
+        record = Record.join(beside)
         results.append(
             FileResult(file=file, sha256=file_digest(path.parent / file), rows=len(record))
         )
@@ -251,9 +256,9 @@ def _load(path: Path, spec: Spec, part: PartSection, name: str, *, stays: bool =
             Warning("thinned", f"{kept}; content above the new Nyquist frequency is aliased."),
         )
     warnings += _guessed_encoding(path, files, name)
-    warnings += _other_units(path, spec, files, name, part.columns)
+    warnings += _other_units(path, spec, files, name, part.column_sets)
     if spec.data.time is None:
-        warnings += _other_step(path, spec, files, name, part.columns)
+        warnings += _other_step(path, spec, files, name, part.column_sets)
     if not record.even:
         warnings += (_uneven_steps(name, record),)
     if name == "train":
@@ -286,9 +291,15 @@ def _open_in_files(
             f"{path}: 'data.{name}': `rows` and `every` need the rows in memory; "
             'write the files that way, or set engine.kind = "memory".'
         )
+    if len(part.column_sets) > 1:
+        raise InputError(
+            f"{path}: 'data.{name}.columns': experiments beside each other need the rows in "
+            'memory; give each channel one column, or set engine.kind = "memory".'
+        )
     few_arenas()
     places = [path.parent / file for file in files]
-    source = open_parquet(places, **_options(spec, part), partition_rows=spec.engine.partition_rows)
+    options = _options(spec, part.column_sets[0])
+    source = open_parquet(places, **options, partition_rows=spec.engine.partition_rows)
     rows: dict[str, int] = {}
     for partition in source.partitions:
         rows[partition.path] = rows.get(partition.path, 0) + partition.rows
@@ -303,9 +314,9 @@ def _open_in_files(
     record = replace(
         record, experiments=tuple(replace(e, source=names[e.source]) for e in record.experiments)
     )
-    total, warnings = sum(rows.values()), _other_units(path, spec, files, name, part.columns)
+    total, warnings = sum(rows.values()), _other_units(path, spec, files, name, part.column_sets)
     if spec.data.time is None:
-        warnings += _other_step(path, spec, files, name, part.columns)
+        warnings += _other_step(path, spec, files, name, part.column_sets)
     if len(record) < total:
         text = (
             f"{name}: findings and figures use {len(record)} of {total} rows, in windows "
@@ -315,18 +326,19 @@ def _open_in_files(
     return FilePart(name, record, part.skip, source, tuple(results), warnings)
 
 
-def _options(spec: Spec, part: PartSection) -> dict[str, Any]:
-    """Return the options for reading the files of a part, in memory or not."""
+def _options(spec: Spec, columns: Mapping[str, str]) -> dict[str, Any]:
+    """Return the options for reading an experiment of these columns, in memory or not."""
     data = spec.data
     named = {key: getattr(data, key) for key in ("sampling_time", "time", "experiment", "missing")}
     channels = {"inputs": spec.channels(data.inputs), "outputs": spec.channels(data.outputs)}
-    return named | channels | {"columns": part.columns}
+    return named | channels | {"columns": columns}
 
 
-def _used_columns(spec: Spec, columns: Mapping[str, str]) -> set[str]:
+def _used_columns(spec: Spec, sets: Sequence[Mapping[str, str]]) -> set[str]:
     """Return the columns of a part's files that are channels, or that separate experiments."""
     channels = [*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs)]
-    return {columns.get(c.name, c.file_column) for c in channels} | {spec.data.experiment or ""}
+    named = {columns.get(c.name, c.file_column) for columns in sets for c in channels}
+    return named | {spec.data.experiment or ""}
 
 
 def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warning, ...]:
@@ -346,29 +358,30 @@ def _guessed_encoding(path: Path, files: Sequence[str], name: str) -> tuple[Warn
 
 
 def _other_units(
-    path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
+    path: Path, spec: Spec, files: Sequence[str], name: str, sets: Sequence[Mapping[str, str]]
 ) -> tuple[Warning, ...]:
     """Return the warnings of the first file whose headers have other units than the channels.
 
     A test in a file of the training data repeats none.
     """
     known = expand_files(path, spec.data.train.files, "train") if name != "train" else ()
-    found = _unit_faults(path, spec, [file for file in files if file not in known], columns)
+    found = _unit_faults(path, spec, [file for file in files if file not in known], sets)
     return tuple(fault.warning for fault in found)
 
 
 def training_unit_faults(path: Path, spec: Spec) -> list[UnitFault]:
     """Return the channels of the training data whose columns have another unit."""
     files = expand_files(path, spec.data.train.files, "train")
-    return _unit_faults(path, spec, files, spec.data.train.columns)
+    return _unit_faults(path, spec, files, spec.data.train.column_sets)
 
 
 def _unit_faults(
-    path: Path, spec: Spec, files: Sequence[str], columns: Mapping[str, str]
+    path: Path, spec: Spec, files: Sequence[str], sets: Sequence[Mapping[str, str]]
 ) -> list[UnitFault]:
     """Return what the first file with other units in its headers shows."""
     channels = {
         columns.get(channel.name, channel.file_column): channel
+        for columns in sets
         for channel in (*spec.channels(spec.data.inputs), *spec.channels(spec.data.outputs))
     }
     every = (unit_faults(path.parent / file, channels) for file in files)
@@ -376,10 +389,10 @@ def _unit_faults(
 
 
 def _other_step(
-    path: Path, spec: Spec, files: Sequence[str], name: str, columns: Mapping[str, str]
+    path: Path, spec: Spec, files: Sequence[str], name: str, sets: Sequence[Mapping[str, str]]
 ) -> tuple[Warning, ...]:
     """Return a warning where the sampling time of a file differs from that of the spec."""
-    used = _used_columns(spec, columns)
+    used = _used_columns(spec, sets)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
         clock = read_clock(path.parent / file, used)

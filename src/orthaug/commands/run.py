@@ -108,6 +108,8 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
 
     None for a file that the model was not trained on.
     """
+    from orthaug.commands.data_sections import column_sets
+
     digest = file_digest(data)
     for content in results_beside(model):
         with suppress(AttributeError, KeyError, TypeError, ValueError):
@@ -119,7 +121,7 @@ def trained_reading(model: Path, data: Path) -> ReadOptions | None:
                     "keep" if kept else "skip",
                     rows,
                     int(part.get("every") or 1),
-                    dict(part.get("columns") or {}),
+                    column_sets(part.get("columns") or {})[0],
                     True,
                 )
     return None
