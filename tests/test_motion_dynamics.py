@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -47,9 +47,24 @@ def numbers(motion: oa.Motion, weights=()) -> Numbers:
     )
 
 
-def with_learner(motion: oa.Motion, substeps: int) -> tuple[MotionDynamics, Numbers]:
+@dataclass(frozen=True)
+class Cubic:
+    """A learner that is no network."""
+
+    inputs = None
+
+    def init(self, key, nz, ny):
+        return {"linear": np.zeros((ny, nz)), "cubic": np.zeros((ny, nz))}
+
+    def apply(self, tree, z):
+        return tree["linear"] @ z + tree["cubic"] @ z**3
+
+
+def with_learner(
+    motion: oa.Motion, substeps: int, learner: oa.Learner | None = None
+) -> tuple[MotionDynamics, Numbers]:
     features = tuple(parse_named(text, motion.known, "feature") for text in ("v", "x*u"))
-    bound = Bound(oa.MLP((3,)), 2, 2)
+    bound = Bound(learner or oa.MLP((3,)), 2, 2)
     weights = 0.3 * np.random.default_rng(0).normal(size=bound.size)
     return MotionDynamics(motion, features, bound, TS, substeps), numbers(motion, weights)
 
@@ -138,14 +153,22 @@ def test_inputs_between_samples() -> None:
 
 
 @pytest.mark.parametrize(
-    ("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")]
+    ("substeps", "hold", "learner"),
+    [
+        (1, "zero-order", oa.MLP((3,))),
+        (2, "spline", oa.MLP((3,))),
+        (5, "first-order", oa.MLP((3,))),
+        (1, "zero-order", oa.MLP((16, 16), "relu")),  # so many slopes that stages are a loop
+        (3, "spline", oa.MLP(())),
+        (2, "zero-order", Cubic()),
+    ],
 )
 def test_the_adjoint_of_the_stages_gives_the_derivatives(
-    integrator: str, substeps: int, hold: str
+    substeps: int, hold: str, learner: oa.Learner
 ) -> None:
-    form, made = with_learner(spring(integrator=integrator, hold=hold, learned=True), substeps)
+    form, made = with_learner(spring(integrator="rk4", hold=hold, learned=True), substeps, learner)
     rng = np.random.default_rng(3)
-    points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
+    points = {"zero-order": 1, "first-order": 2, "spline": 2 * substeps + 1}[hold]
     state, inputs = rng.normal(size=(2, 5)), rng.normal(size=(points, 5))
     given = (made, state, inputs)
     ours, plain = (

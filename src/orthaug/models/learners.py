@@ -68,6 +68,7 @@ class Learner(Protocol):
 
 
 _SMALL_PRODUCT = 128  # weights of a layer whose product is summed in the step of a run
+_MANY_POINTS = 512  # beside each other, from which a matrix product is faster
 
 
 @dataclass(frozen=True)
@@ -189,6 +190,43 @@ class MLP:
         for weight, bias, activation in self.layers(tree):
             z = ACTIVATIONS[activation](weight @ z + bias)
         return z
+
+    def run(self, tree: Tree, z: Float[Array, "nz m"]) -> tuple[Float[Array, "ny m"], list[Any]]:
+        """Return values at m points, and what `pull` needs: each layer's inputs and slopes."""
+        inside = []
+        for weight, bias, activation in self.layers(tree):
+            sums = _product_at_points(weight, z) + bias[:, None]
+            value, slope = jax.jvp(ACTIVATIONS[activation], (sums,), (jnp.ones_like(sums),))
+            inside.append((z, slope))
+            z = value
+        return z, inside
+
+    def pull(
+        self, tree: Tree, inside: list[Any], rows: Float[Array, "k ny m"]
+    ) -> tuple[list[Array], Array]:
+        """Return rows · ∂f/∂w as arrays (k, …, m) in the tree's order, and rows · ∂f/∂z."""
+        to_weights: list[Array] = []
+        for (weight, _, activation), (below, slope) in reversed(
+            list(zip(self.layers(tree), inside, strict=True))
+        ):
+            rows = rows if activation == "identity" else rows * slope
+            to_weights = [rows[:, :, None] * below[None, None], rows, *to_weights]
+            rows = _rows_through(weight, rows)
+        return to_weights, rows
+
+
+def _product_at_points(weight: Array, z: Float[Array, "nz m"]) -> Any:
+    """Return `weight @ z`, as sums along the points where there are few of both."""
+    if weight.size > _SMALL_PRODUCT or z.shape[1] > _MANY_POINTS:
+        return weight @ z
+    return sum(weight[:, i, None] * z[None, i] for i in range(len(z)))
+
+
+def _rows_through(weight: Array, rows: Float[Array, "k l m"]) -> Any:
+    """Return rows · weight at m points, as sums along the points where the weights are few."""
+    if weight.size > _SMALL_PRODUCT:
+        return jnp.einsum("li,klm->kim", weight, rows)
+    return sum(weight[i, :, None] * rows[:, i, None] for i in range(len(weight)))
 
 
 def _few_rows_product(weight: Any, z: Any) -> Any:
@@ -503,10 +541,54 @@ class Bound:
 
     def one_of_many(self, leaves: Sequence[Array], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
         """Return `from_leaves` where thousands of rows are mapped side by side."""
-        learner = self.learner
-        if isinstance(learner, MLP) and type(learner).apply is MLP.apply:  # no subclass's own
-            return learner.apply_to_many(self.tree(leaves), z)
+        if self._is_plain_mlp:
+            return self.learner.apply_to_many(self.tree(leaves), z)  # type: ignore[attr-defined]
         return self.from_leaves(leaves, z)
+
+    def run(
+        self, w: Float[Array, "nw"] | list[Any], z: Float[Array, "nz m"]
+    ) -> tuple[Float[Array, "ny m"], Any]:
+        """Return f at m points, and what `pull` needs for its derivatives there.
+
+        Points are the last axis: every entry is contiguous along them.
+        """
+        leaves = w if isinstance(w, list) else self.leaves(w)
+        if self._is_plain_mlp:
+            return self.learner.run(self.tree(leaves), z)  # type: ignore[attr-defined]
+        return jax.vmap(lambda z: self.one_of_many(leaves, z), -1, -1)(z), z
+
+    def pull(
+        self, w: Float[Array, "nw"] | list[Any], kept: Any, rows: Float[Array, "k ny m"]
+    ) -> tuple[list[Array], Float[Array, "k nz m"]]:
+        """Return rows · ∂f/∂w, an array (k, …, m) for each of w, and rows · ∂f/∂z, at m points.
+
+        It is one pass backwards for each row. A derivative that does not exist is 0.
+
+        Args:
+            kept: as `run` returns it.
+        """
+        leaves = w if isinstance(w, list) else self.leaves(w)
+        if self._is_plain_mlp:
+            return self.learner.pull(self.tree(leaves), kept, rows)  # type: ignore[attr-defined]
+
+        def at_one_point(z: Array, rows: Array) -> Any:
+            back = jax.vjp(self.one_of_many, leaves, z)[1]
+            return jax.tree.map(lambda *parts: jnp.stack(parts), *map(back, rows))
+
+        pulled = jax.vmap(at_one_point, -1, -1)(kept, rows)
+        return jax.tree.map(lambda part: jnp.where(jnp.isfinite(part), part, 0.0), pulled)
+
+    def columns(self, leaves: Sequence[Array]) -> Float[Array, "k nw m"]:
+        """Return what `pull` returns by the weights, side by side."""
+        if not leaves:
+            raise ValueError("the learner has no weights")
+        k, m = leaves[0].shape[0], leaves[0].shape[-1]
+        return jnp.concatenate([leaf.reshape(k, -1, m) for leaf in leaves], axis=1)
+
+    @property
+    def _is_plain_mlp(self) -> bool:
+        """True for an `MLP` whose values no subclass computes in its own way."""
+        return isinstance(self.learner, MLP) and type(self.learner).apply is MLP.apply
 
     def tree(self, leaves: Sequence[AnyArray]) -> Tree:
         """Return the learner's own weights, of the weight arrays."""

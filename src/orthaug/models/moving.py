@@ -27,7 +27,6 @@ from orthaug.models.learners import nothing_learned
 from orthaug.models.motion_field import MotionField, inputs_along, parts_at
 from orthaug.physics.guessed_motion import guess, layout_of
 from orthaug.physics.integrators import (
-    UNROLLED,
     Exponentials,
     advance,
     input_at,
@@ -37,107 +36,205 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import Coordinates
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
+_MOST_KEPT = 32  # substeps whose stages are kept in memory until their slopes are multiplied
+_FUSED = 250  # slopes of a state up to which the stages of a step are one piece
 
 
 class Slopes(NamedTuple):
-    """Value of a map from (x, c, w), and ∂/∂x, ∂/∂c, ∂/∂w."""
+    """Value of a map from (x, c, w) at m points, and ∂/∂x, ∂/∂c, ∂/∂w.
+
+    Points are the last axis everywhere: arithmetic on small matrices then runs along it.
+    """
 
     value: Any
-    to_x: Array
+    to_x: Any
     to_c: Any
-    to_w: Array
+    to_w: Any
 
 
-def sample_slopes(form: MotionField, numbers: Numbers, state: Array, row: Array) -> Slopes:
-    """Return x one sample later with its slopes, at one state (nx,) and input row, under `rk4`."""
-    row, pace = form.split_pace(row)
-    at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
-    h, identity = pace * form.sampling_time / form.substeps, jnp.eye(form.states)
-    through, x = [], state
-    for j in range(form.substeps):
-        u = [at(2 * j + i, halves) for i in range(3)]
-        first = field_slopes(form, numbers, x, u[0])
-        second = field_slopes(form, numbers, x + h / 2 * first.value, u[1])
-        third = field_slopes(form, numbers, x + h / 2 * second.value, u[1])
-        fourth = field_slopes(form, numbers, x + h * third.value, u[2])
-        x = x + h / 6 * (first.value + 2 * (second.value + third.value) + fourth.value)
-        psi4 = h / 6 * identity
-        psi3 = h / 3 * identity + h * psi4 @ fourth.to_x
-        psi2 = h / 3 * identity + h / 2 * psi3 @ third.to_x
-        psi1 = h / 6 * identity + h / 2 * psi2 @ second.to_x
-        through.append(
-            list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True))
-        )
-    to_x, to_c, to_w = identity, 0.0, jnp.zeros((form.states, form.bound.size))
-    learned = np.array(form.corrected[0], dtype=int)
-    for stages in reversed(through):  # `to_x` is what follows this substep
-        to_c = to_c + to_x @ sum(psi @ stage.to_c for psi, stage in stages)
-        if learned.size:
-            to_w = to_w + sum((to_x @ psi)[:, learned] @ stage.to_w for psi, stage in stages)
-        to_x = to_x @ (identity + sum(psi @ stage.to_x for psi, stage in stages))
-    return Slopes(x, to_x, to_c, to_w)
+class FieldSlopes(NamedTuple):
+    """Value of F at m points, ∂F/∂x, ∂F/∂c, and what `Bound.pull` needs for ∂F/∂w."""
+
+    value: Any
+    to_x: Any
+    to_c: Any
+    kept: Any
+
+
+def sample_slopes(
+    form: MotionField, numbers: Numbers, states: Float[Array, "nx m"], rows: Float[Array, "r m"]
+) -> Slopes:
+    """Return x one sample later with its slopes, of m states and input rows, under `rk4`.
+
+    The stages are run first; then the slopes of where the sample ends go back through them, with
+    one pass through the learner for each state, and never one for each weight.
+    """
+    halves, nu, learned = 2 * form.substeps, len(form.motion.inputs), form.corrected[0]
+
+    def at_points(row: Array) -> tuple[Array, Any]:
+        row, pace = form.split_pace(row)
+        at = input_at(row, nu)
+        return jnp.stack([at(i, halves) for i in range(halves + 1)]), jnp.asarray(pace)
+
+    points, pace = jax.vmap(at_points, -1, -1)(rows)
+    h = pace * form.sampling_time / form.substeps
+    over_substeps = _unrolled if form.substeps <= 2 else jax.lax.scan
+    # Fused, XLA computes what a stage finds anew for each use of it, of which there are many
+    over_stages = _unrolled if form.states * form.unknowns <= _FUSED else jax.lax.scan
+
+    def substep(x: Array, u: tuple[Array, ...]) -> tuple[Any, FieldSlopes]:
+        def stage(rates: Array, given: tuple[Array, Array]) -> tuple[Any, FieldSlopes]:
+            ahead, u = given
+            slopes = field_slopes(form, numbers, x + ahead * h * rates, u)
+            return slopes.value, slopes
+
+        first, middle, last = u
+        given = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.stack([first, middle, middle, last])
+        stages = over_stages(stage, jnp.zeros_like(x), given)[1]
+        rates = stages.value
+        return x + h / 6 * (rates[0] + 2 * (rates[1] + rates[2]) + rates[3]), stages
+
+    def back(slopes: Slopes, stages: FieldSlopes) -> tuple[Slopes, None]:
+        def before(sums: tuple[Array, ...], given: tuple[Array, ...]) -> tuple[Any, Array]:
+            """Go to the stage before, with the slopes by F of the one behind it, by x and by c."""
+            (share, to_x, to_c), (own, through, next_to_x, stage_to_x, stage_to_c) = sums, given
+            share = h * (own * slopes.to_x + through * _product(share, next_to_x))
+            sums = share, to_x + _product(share, stage_to_x), to_c + _product(share, stage_to_c)
+            return sums, _learner_rows(form, numbers, share, learned, 0) if learned else share
+
+        weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6, jnp.array([0.5, 0.5, 1.0, 0.0])
+        given = (*weights, jnp.roll(stages.to_x, -1, axis=0), stages.to_x, stages.to_c)
+        begun = slopes.to_x, slopes.to_x, slopes.to_c
+        (_, to_x, to_c), rows = over_stages(before, begun, given, reverse=True)
+        to_w = slopes.to_w
+        if learned:
+            to_w = to_w + _through_learner(form, numbers, rows, stages.kept)
+        return Slopes(slopes.value, to_x, to_c, to_w), None
+
+    end, stages = over_substeps(substep, states, (points[:-2:2], points[1:-1:2], points[2::2]))
+    n, m = states.shape
+    nothing = (jnp.zeros((n, count, m)) for count in (len(numbers.c), form.bound.size))
+    return over_substeps(back, Slopes(end, _identity(n, m), *nothing), stages, reverse=True)[0]
+
+
+def _through_learner(
+    form: MotionField, numbers: Numbers, rows: Float[Array, "s nx ny m"], kept: Any
+) -> Float[Array, "nx nw m"]:
+    """Return the sum over stages of rows · ∂f/∂w."""
+    pulled = []
+    for i, own in enumerate(rows):
+        at_stage = jax.tree.map(lambda part, i=i: part[i], kept)
+        pulled.append(form.bound.pull(numbers.weights, at_stage, own)[0])
+    return form.bound.columns([sum(parts) for parts in zip(*pulled, strict=True)])
+
+
+def _unrolled(function: Any, carry: Any, given: Any, *, reverse: bool = False) -> tuple[Any, Any]:
+    """Return `jax.lax.scan` in one piece, which is faster for small slopes."""
+    steps = len(jax.tree.leaves(given)[0])
+    found: list[Any] = [None] * steps
+    for i in reversed(range(steps)) if reverse else range(steps):
+        carry, found[i] = function(carry, jax.tree.map(lambda part, i=i: part[i], given))
+    return carry, jax.tree.map(lambda *parts: jnp.stack(parts), *found)
 
 
 @partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
-def field_slopes(form: MotionField, numbers: Numbers, x: Array, u: Array) -> Slopes:
-    """Return F and its slopes at one point.
+def field_slopes(
+    form: MotionField, numbers: Numbers, x: Float[Array, "nx m"], u: Float[Array, "nu m"]
+) -> FieldSlopes:
+    """Return F and its slopes at m points."""
+    coordinates, states = form.motion.coordinates, form.corrected[0]
 
-    ∂/∂w is that of the learned equations only, (nl, nw).
-    """
-    c = numbers.c
-    coordinates = form.motion.coordinates
+    def physics(x: Array, u: Array) -> tuple[Any, Any, Any]:
+        def rates(x: Array, c: Array) -> Array:
+            return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
 
-    def physics(x: Array, c: Array) -> Array:
-        return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
+        return _differentiate(rates, x, numbers.c, form.motion)
 
-    value, to_x, to_c = _differentiate(physics, x, c, form.motion)
+    value, to_x, to_c = jax.vmap(physics, -1, -1)(x, u)
     to_x, to_c = _finite(to_x), _finite(to_c)
-    states, _ = form.corrected
     if not states:
-        return Slopes(value, to_x, to_c, jnp.zeros((len(states), form.unknowns - len(c))))
-    learner = learner_slopes(form, numbers, x, u)
-    rows = np.array(states)
-    count = len(states)
-    value = value.at[rows].add(learner.value[:count])
-    return Slopes(value, to_x.at[rows].add(learner.to_x[:count]), to_c, learner.to_w[:count])
+        return FieldSlopes(value, to_x, to_c, ())
+    kept, g, g_to_x = learner_slopes(form, numbers, x, u)
+    value, to_x = (_add_to_rows(a, states, b) for a, b in ((value, g), (to_x, g_to_x)))
+    return FieldSlopes(value, to_x, to_c, kept)
 
 
-def learner_slopes(form: MotionField, numbers: Numbers, x: Array, u: Array) -> Slopes:
-    """Return g and its slopes at one point: learned equations first, then learned outputs."""
-    bound = form.bound
+def learner_slopes(
+    form: MotionField, numbers: Numbers, x: Array, u: Array
+) -> tuple[Any, Array, Array]:
+    """Return what `Bound.pull` needs, g and ∂g/∂x at m points.
 
-    def features(x: Array) -> Any:
+    Learned equations come first, then learned outputs.
+    """
+
+    def features(x: Array, u: Array) -> Any:
         return (form.seen(x, u) - numbers.centre) / numbers.halfwidth
 
-    z, to_z = features(x), _finite(jax.jacfwd(features)(x))
-    value, pull = jax.vjp(
-        lambda leaves, z: bound.from_leaves(leaves, z), bound.leaves(numbers.weights), z
-    )
-    gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (bound.ny,))
-    pulled = [pull(row) for row in jnp.diag(gain)]
-    to_w = jnp.stack(
-        [jnp.concatenate([jnp.ravel(leaf) for leaf in leaves]) for leaves, _ in pulled]
-    )
-    to_x = jnp.stack([of_z @ to_z for _, of_z in pulled])
-    return Slopes(gain * value, _finite(to_x), jnp.zeros((bound.ny, 0)), _finite(to_w))
+    z = jax.vmap(features, -1, -1)(x, u)
+    z_to_x = _finite(jax.vmap(jax.jacfwd(features), -1, -1)(x, u))
+    value, kept = form.bound.run(numbers.weights, z)
+    ny, m = value.shape
+    gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (ny,))[:, None]
+    to_z = form.bound.pull(numbers.weights, kept, _identity(ny, m) * gain)[1]
+    return kept, gain * value, _finite(_product(to_z, z_to_x))
 
 
-def output_slopes(form: MotionField, numbers: Numbers, x: Array, u: Any) -> Slopes:
-    """Return y and its slopes at one point."""
-    c = numbers.c
+def _learner_rows(
+    form: MotionField, numbers: Numbers, rows: Float[Array, "k l m"], places: Sequence[int], at: int
+) -> Float[Array, "k ny m"]:
+    """Return rows that multiply the learner's values, of rows that multiply g where it is added.
 
-    def physics(x: Array, c: Array) -> Array:
-        return form.motion.observed(x, u, form.motion.coordinates.physical(c, jnp), jnp)
+    Args:
+        places: columns of `rows` that the learner is added to.
+        at: number of the first of them among the learner's values.
+    """
+    ny = form.bound.ny
+    gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (ny,))[None, :, None]
+    chosen = [rows[:, i] for i in places]
+    none = [jnp.zeros_like(rows[:, 0])]
+    return jnp.stack([*none * at, *chosen, *none * (ny - at - len(chosen))], axis=1) * gain
 
-    value, to_x, to_c = _differentiate(physics, x, c, form.motion)
-    to_w = jnp.zeros((len(value), form.unknowns - len(c)))
-    states, outputs = form.corrected
+
+def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) -> Slopes:
+    """Return y and its slopes at m points, of states and inputs."""
+    coordinates, (states, outputs) = form.motion.coordinates, form.corrected
+    u = jax.vmap(form.now, -1, -1)(inputs)
+
+    def physics(x: Array, u: Array) -> tuple[Any, Any, Any]:
+        def observed(x: Array, c: Array) -> Array:
+            return form.motion.observed(x, u, coordinates.physical(c, jnp), jnp)
+
+        return _differentiate(observed, x, numbers.c, form.motion)
+
+    value, to_x, to_c = jax.vmap(physics, -1, -1)(x, u)
+    to_w = jnp.zeros((len(value), form.unknowns - len(numbers.c), x.shape[1]))
     if outputs:
-        learner, rows, count = learner_slopes(form, numbers, x, u), np.array(outputs), len(states)
-        value = value.at[rows].add(learner.value[count:])
-        to_x = to_x.at[rows].add(learner.to_x[count:])
-        to_w = to_w.at[rows].set(learner.to_w[count:])
+        kept, *learned = learner_slopes(form, numbers, x, u)
+        g, g_to_x = (part[len(states) :] for part in learned)
+        one = _identity(len(outputs), x.shape[1])
+        rows = _learner_rows(form, numbers, one, range(len(outputs)), len(states))
+        g_to_w = form.bound.columns(form.bound.pull(numbers.weights, kept, rows)[0])
+        own = ((value, g), (to_x, g_to_x), (to_w, g_to_w))
+        value, to_x, to_w = (_add_to_rows(a, outputs, b) for a, b in own)
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
+
+
+def _identity(n: int, m: int) -> Array:
+    return jnp.broadcast_to(jnp.eye(n)[:, :, None], (n, n, m))
+
+
+def _add_to_rows(a: Array, places: Sequence[int], b: Array) -> Array:
+    """Return a with the first rows of b added at these places."""
+    if list(places) == list(range(len(a))):
+        return a + b[: len(a)]
+    return a.at[np.array(places)].add(b[: len(places)])
+
+
+def _product(a: Float[Array, "i k m"], b: Float[Array, "k j m"]) -> Any:
+    """Return the matrix products at m points, as sums along the points where matrices are small."""
+    if not 0 < a.shape[1] <= _FEW:
+        return jnp.einsum("ikm,kjm->ijm", a, b)
+    return sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
 
 
 def _differentiate(function: Any, x: Array, c: Any, motion: Motion) -> tuple[Any, Any, Any]:
@@ -340,8 +437,8 @@ class MotionDynamics(MotionField, AutodiffDynamics):
 
     @property
     def _by_stages(self) -> bool:
-        few = self.substeps <= UNROLLED and not self._large and not self.motion.held
-        return self.motion.scheme.has_adjoint and few and self.differentiable
+        plain = self.substeps <= _MOST_KEPT and not self._large and not self.motion.held
+        return self.motion.scheme.has_adjoint and plain and self.differentiable
 
     def tangents(
         self, numbers: Numbers, state: Array, slopes: Array, inputs: Array
@@ -349,7 +446,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return self.local(numbers, state, inputs).along(slopes, fused=self._by_stages)
 
     def local(self, numbers: Numbers, states: Array, inputs: Array) -> Local:
-        """Return the slopes of a few Runge-Kutta substeps by the adjoint of their stages.
+        """Return the slopes of Runge-Kutta substeps by the adjoint of their stages.
 
         Other schemes are differentiated automatically.
         """
@@ -358,10 +455,8 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             return Local(value, to_state, to_unknowns + self._by_scheme(numbers, states, inputs))
         if not self._by_stages or numbers.limits is not None:
             return super().local(numbers, states, inputs)
-        following = jax.vmap(partial(sample_slopes, self, numbers), -1, -1)(states, inputs)
-        output = jax.vmap(lambda x, row: output_slopes(self, numbers, x, self.now(row)), -1, -1)(
-            states, inputs
-        )
+        following = sample_slopes(self, numbers, states, inputs)
+        output = output_slopes(self, numbers, states, inputs)
         value, to_x, *own = (jnp.concatenate(both) for both in zip(following, output, strict=True))
         return Local(value, to_x, jnp.concatenate(own, axis=1))
 
