@@ -571,6 +571,9 @@ class Bound:
         if self._is_plain_mlp:
             return self.learner.pull(self.tree(leaves), kept, rows)  # type: ignore[attr-defined]
 
+        if not self.differentiable:  # and without weights
+            return [], jnp.zeros((len(rows), *kept.shape))
+
         def at_one_point(z: Array, rows: Array) -> Any:
             back = jax.vjp(self.one_of_many, leaves, z)[1]
             return jax.tree.map(lambda *parts: jnp.stack(parts), *map(back, rows))
@@ -578,12 +581,12 @@ class Bound:
         pulled = jax.vmap(at_one_point, -1, -1)(kept, rows)
         return jax.tree.map(lambda part: jnp.where(jnp.isfinite(part), part, 0.0), pulled)
 
-    def columns(self, leaves: Sequence[Array]) -> Float[Array, "k nw m"]:
-        """Return what `pull` returns by the weights, side by side."""
-        if not leaves:
-            raise ValueError("the learner has no weights")
-        k, m = leaves[0].shape[0], leaves[0].shape[-1]
-        return jnp.concatenate([leaf.reshape(k, -1, m) for leaf in leaves], axis=1)
+    @staticmethod
+    def columns(leaves: Sequence[Array], rows: Float[Array, "k _ m"]) -> Float[Array, "k nw m"]:
+        """Return what `pull` returned of rows by the weights, side by side."""
+        k, _, m = rows.shape
+        none = jnp.zeros((k, 0, m))  # a learner may have no weights
+        return jnp.concatenate([none, *(leaf.reshape(k, -1, m) for leaf in leaves)], axis=1)
 
     @property
     def _is_plain_mlp(self) -> bool:
@@ -599,26 +602,13 @@ class Bound:
     ) -> tuple[Float[Array, "ny m"], Float[Array, "nw ny m"]]:
         """Return `G f` and `G ∂f/∂w` for a batch of rows, G the `gain` of each.
 
-        Reverse mode per row, one pass per output. The batch is the *last* axis: every entry of the
-        Jacobian is then contiguous over rows, which is 2.5 times faster here than rows first.
+        One pass backwards per output. The batch is the *last* axis: every entry of the Jacobian is
+        then contiguous over rows, which is 2.5 times faster here than rows first.
         """
-
-        def one_row(
-            leaves: Sequence[Array], z_row: Array, gain_row: Array
-        ) -> tuple[Any, list[Any]]:
-            value, pullback = jax.vjp(lambda tree: self.one_of_many(tree, z_row), leaves)
-            scaled = sum(gain_row[:, i] * value[i] for i in range(self.ny))
-            return scaled, [pullback(gain_row[i])[0] for i in range(self.ny)]
-
-        values, per_output = jax.vmap(one_row, in_axes=(None, -1, -1), out_axes=-1)(
-            self.leaves(w), z, gain
-        )
-        batch = z.shape[-1]
-        none = jnp.zeros((0, batch))  # a learner may have no weights
-        columns = [
-            jnp.concatenate([none, *(g.reshape(-1, batch) for g in grads)]) for grads in per_output
-        ]
-        return values, jnp.stack(columns, axis=1) if len(columns) > 1 else columns[0][:, None, :]
+        values, kept = self.run(w, z)
+        scaled = sum(gain[:, i] * values[i] for i in range(self.ny))
+        to_leaves, _ = self.pull(w, kept, gain)
+        return scaled, jnp.moveaxis(self.columns(to_leaves, gain), 0, 1)
 
 
 @partial(jax.jit, static_argnames="bound")

@@ -125,7 +125,7 @@ def _through_learner(
     for i, own in enumerate(rows):
         at_stage = jax.tree.map(lambda part, i=i: part[i], kept)
         pulled.append(form.bound.pull(numbers.weights, at_stage, own)[0])
-    return form.bound.columns([sum(parts) for parts in zip(*pulled, strict=True)])
+    return form.bound.columns([sum(parts) for parts in zip(*pulled, strict=True)], rows[0])
 
 
 def _unrolled(function: Any, carry: Any, given: Any, *, reverse: bool = False) -> tuple[Any, Any]:
@@ -213,7 +213,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) 
         g, g_to_x = (part[len(states) :] for part in learned)
         one = _identity(len(outputs), x.shape[1])
         rows = _learner_rows(form, numbers, one, range(len(outputs)), len(states))
-        g_to_w = form.bound.columns(form.bound.pull(numbers.weights, kept, rows)[0])
+        g_to_w = form.bound.columns(form.bound.pull(numbers.weights, kept, rows)[0], rows)
         own = ((value, g), (to_x, g_to_x), (to_w, g_to_w))
         value, to_x, to_w = (_add_to_rows(a, outputs, b) for a, b in own)
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
