@@ -27,6 +27,7 @@ from orthaug.models.learners import nothing_learned
 from orthaug.models.motion_field import MotionField, inputs_along, parts_at
 from orthaug.physics.guessed_motion import guess, layout_of
 from orthaug.physics.integrators import (
+    UNROLLED,
     Exponentials,
     advance,
     input_at,
@@ -78,7 +79,7 @@ def sample_slopes(
 
     points, pace = jax.vmap(at_points, -1, -1)(rows)
     h = pace * form.sampling_time / form.substeps
-    over_substeps = _unrolled if form.substeps <= 2 else jax.lax.scan
+    over_substeps = _unrolled if form.substeps <= (2 if learned else UNROLLED) else jax.lax.scan
     # Fused, XLA computes what a stage finds anew for each use of it, of which there are many
     over_stages = _unrolled if form.states * form.unknowns <= _FUSED else jax.lax.scan
 
