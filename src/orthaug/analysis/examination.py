@@ -40,6 +40,7 @@ from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import fit as train
+from orthaug.fitting.held_out import covered_folds
 from orthaug.fitting.status import Status
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.inference.over_experiments import differing_warning
@@ -516,9 +517,10 @@ def cross_validated(evidence: Evidence, blocks: int, fits: Sequence[Any]) -> lis
         setup.fold_fit(criterion, physics_only=True),
         *(fit.setup.fold_fit(fit.criterion) for fit in fits),
     ]
+    record = evidence.train.record
     try:
-        options: dict[str, Any] = {"start": evidence.problem.first_row, "runner": evidence.runner}
-        errors = cross_validate(evidence.train.record, folds, blocks=blocks, **options)
+        cut = covered_folds(record, blocks, evidence.problem.first_row, fits[0].model)
     except InputError:
         return [[] for _ in fits]
-    return [block_trials(errors, 1 + j) for j in range(len(fits))]
+    errors = cross_validate(record, folds, folds=cut, runner=evidence.runner)
+    return [block_trials(errors, 1 + j, cut.note) for j in range(len(fits))]

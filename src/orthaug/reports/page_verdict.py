@@ -26,6 +26,7 @@ _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error i
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _UNSTABLE = "unstable_plant"
 _RAN_AWAY = "free_run_diverged"
+_COLOURED = "coloured_residual"  # of the free run of a fit that takes it for white
 # Of models that are as good as each other these are taken first
 _TIED = ("orthogonal", "physics alone")
 
@@ -324,6 +325,12 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    error, _ = _worst_score(result.scores)
+    if error is not None and error > _GOOD:
+        if result.residuals is None:
+            yield "its residual could not be tested"
+        elif result.residuals.verdict == "equation_noise" and _has_warning(result, _COLOURED):
+            yield "its errors are large and correlated with their past"
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
     if _is_biased_by_feedback(result):
