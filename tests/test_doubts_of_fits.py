@@ -488,6 +488,7 @@ def test_a_term_that_begins_beyond_a_size_is_named_with_that_size(
     assert (best.equation, best.variable, best.shape) == ("v", variable, "beyond")
     assert best.width == pytest.approx(size, rel=0.15) and best.share > 0.8
     assert best.coefficient < 0 and f"that begins at about |{variable}| = " in str(best)
+    assert ("as where the input saturates at ±" in str(best)) == (variable == "u")
 
 
 def test_a_loss_to_surroundings_counts_from_their_temperature():
