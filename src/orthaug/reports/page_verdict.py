@@ -393,6 +393,7 @@ _UNTESTED = {
     "poor_start": "its training probably ended in a local minimum",
     "several_solutions": "other values of its parameters explain its data as well",
     "parameter_drift": "a parameter changes over its record",
+    "parameter_depends": "a parameter depends on a signal",
     "parameter_by_experiment": "its parameters differ between the experiments",
     "differs_between_experiments": "its parameters differ between the experiments",
     "reset_output": "an output goes on elsewhere within its record",
