@@ -274,7 +274,7 @@ def _has_warning(result: FitResult | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
-def _is_biased_by_feedback(result: FitResult | RowResult) -> bool:
+def is_biased_by_feedback(result: FitResult | RowResult) -> bool:
     """Return whether feedback is in the data, and no noise model that leaves white errors."""
     white = result.residuals is not None and result.residuals.verdict == "white"
     return _has_warning(result, "closed_loop") and not (_has_noise_model(result) and white)
@@ -333,7 +333,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             yield "its errors are large and correlated with their past"
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
-    if _is_biased_by_feedback(result):
+    if is_biased_by_feedback(result):
         yield "its data were probably recorded under feedback, " + (
             "where a noise model needs complete physics and enough orders"
             if _has_noise_model(result)
@@ -501,6 +501,11 @@ def _option(result: FitResult) -> str | None:
         return (
             'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
         )
+    if is_biased_by_feedback(result):
+        return (
+            "data with the reference recorded and the loop simulated (`controller`), with larger "
+            "motions of the reference, or without the controller"
+        )
     predicted = None if result.advice_trials is not None else _predicted_change(result)
     if predicted is not None:
         return predicted
@@ -518,11 +523,6 @@ def _option(result: FitResult) -> str | None:
         )
     if _has_warning(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
-    if _is_biased_by_feedback(result):
-        return (
-            "data with the reference recorded and the loop simulated (`controller`), with larger "
-            "motions of the reference, or without the controller"
-        )
     if _is_undecided(result):
         return (
             "the learner (`training.fallback = false`), because cross-validation does not "
