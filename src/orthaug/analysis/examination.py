@@ -20,7 +20,7 @@ from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores, parameter_rows
 from orthaug.analysis.informative_data import explains_nothing, few_frequencies
 from orthaug.analysis.physics_findings import analyse_physics, describe_physics, imitable
-from orthaug.analysis.robustness import robust_where_asked
+from orthaug.analysis.robustness import beside_plain, robust_where_asked
 from orthaug.analysis.scoring import score_part
 from orthaug.analysis.trained_start import from_trained_start, local_minimum_of_start
 from orthaug.analysis.validation import (
@@ -189,9 +189,16 @@ def _analyse(
     budget = None
     if fit.status.ok:
         plain, (one_step, free_run) = fit, responses[evidence.train.name]
+        asked = "auto" if fit.setup is None else fit.setup.standard_errors
         fit = attempt(
-            "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
+            "the robust covariance",
+            lambda: robust_where_asked(plain, one_step, ordered=asked != "unordered"),
+            warnings,
+            plain,
         )
+        if asked == "plain":
+            warnings += beside_plain(fit, plain)
+            fit = plain
         # Wider errors may leave a parameter without an interval
         gone = [one for one in plain.warnings if one not in fit.warnings]
         warnings[:] = [one for one in warnings if one not in gone]
