@@ -345,6 +345,25 @@ def test_what_a_change_explains_is_called_no_disturbance(tmp_path):
     assert "disturbance" not in text and "noise.model" not in text
 
 
+def test_under_feedback_the_loop_comes_before_what_seems_missing(tmp_path):
+    """Speed under a PI controller, beside a disturbance that lasts."""
+    rng = np.random.default_rng(1)
+    v, total, push, found = 0.0, 0.0, 0.0, []
+    for goal in np.repeat(rng.normal(0, 1.5, 36), 25):
+        total += 0.05 * (goal - v)
+        u = 3 * (goal - v) + 2 * total
+        found.append((u, v + 0.002 * rng.normal()))
+        push = 0.9 * push + 0.05 * rng.normal()
+        for _ in range(10):
+            v += 0.005 * (u + push - 0.3 * v - v * abs(v))
+    text = f'{LAGGED}[training]\nfocus = "simulation"\n'
+    result = oa.fit_spec(str(put(tmp_path, text, np.array(found)))).result
+    first, *others = [one.text for one in result.advice]
+    assert first.startswith("First mend the feedback") and "If errors remain without it" in first
+    assert others and all(text.startswith("If errors remain without it") for text in others)
+    assert fit_verdict(result).then == first
+
+
 def test_a_change_that_runs_away_still_is_no_advice():
     """Of 1,360 and 1,120 deviations neither says anything; 0.02 instead of 1,360 does."""
     rng = np.random.default_rng(1)

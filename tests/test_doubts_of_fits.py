@@ -337,6 +337,25 @@ def test_a_resistance_that_follows_the_heat_of_its_current_is_a_hidden_state(noi
     assert [row.ci95_counts for row in found.parameters] == ["noise only", "noise only"]
 
 
+def test_a_gain_that_depends_on_the_stroke_follows_no_past():
+    """The past of a slow stroke's square was called a part that heats up."""
+    random = np.random.default_rng(2)
+    u, x, v, y = np.repeat(random.normal(size=60), 25), 0.0, 0.0, []
+    for value in u:
+        y.append(x)
+        for _ in range(10):
+            v += 0.002 * (4 * value / (1 + 2 * x**2) - 1.5 * v - 9 * x)
+            x += 0.002 * v
+    noisy = np.array(y) + 0.003 * random.normal(size=1500)
+    record = oa.Record.from_arrays(u, noisy, sampling_time=0.02)
+    terms = [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+    physics = oa.Baseline.from_terms(terms)
+    fit = oa.estimate(record, physics, learner=None, criterion=oa.Simulation())
+    said = {w.code: w.text for w in fit.diagnose().warnings}
+    assert "hidden_state" not in said
+    assert said["parameter_depends"].startswith("b seems to depend on y[k-1]")
+
+
 def test_a_parameter_that_changes_over_the_record_is_named_with_both_ends():
     """A coil that warms up: its resistance rises by a half; under a constant one nothing is said."""
     said = {}
@@ -488,6 +507,7 @@ def test_a_term_that_begins_beyond_a_size_is_named_with_that_size(
     assert (best.equation, best.variable, best.shape) == ("v", variable, "beyond")
     assert best.width == pytest.approx(size, rel=0.15) and best.share > 0.8
     assert best.coefficient < 0 and f"that begins at about |{variable}| = " in str(best)
+    assert ("as where the input saturates at ±" in str(best)) == (variable == "u")
 
 
 def test_a_loss_to_surroundings_counts_from_their_temperature():

@@ -127,6 +127,19 @@ def test_the_diagnosis_reads_the_measured_rows():
     assert fit.diagnose().residuals.verdict == "unmodelled"
 
 
+def test_the_diagnosis_has_the_errors_of_the_scores():
+    """Of two sensors that miss each other's rows it had those of the rows with both."""
+    u, y, rng = signals(rows=600)
+    both = np.column_stack([y, y + 0.05 * rng.normal(size=600)])
+    both[np.arange(600) % 3 == 1, 0], both[400:, 1] = np.nan, np.nan
+    record = oa.Record.from_arrays(u, both, sampling_time=STEP, missing="keep", outputs=["y", "z"])
+    found = fitted(record)[0].diagnose()
+    scores = found.scores["train"].simulation.rmse
+    assert [test.rms for test in found.residuals.free_run] == pytest.approx(scores)
+    text = found.residuals.text
+    assert f"{scores[0]:.3g} of y" in text and f"{scores[1]:.3g} of z" in text
+
+
 def test_what_needs_every_row_says_so():
     u, y, _ = signals()
     y[7] = np.nan

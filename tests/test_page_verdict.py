@@ -117,6 +117,25 @@ def test_a_noise_model_keeps_feedback_right_and_predicts_where_its_free_run_drif
     assert "predict" not in fit_verdict(fitted(0.9, 5.0, warnings=looped, noise=noise)).use[:20]
 
 
+@pytest.mark.parametrize(
+    ("residuals", "warnings", "doubt"),
+    [
+        (None, [], "its residual could not be tested"),
+        ("equation_noise", ["coloured_residual"], "correlated with their past"),
+        ("equation_noise", [], None),
+        ("white", [], None),
+    ],
+)
+def test_a_large_error_that_is_not_white_is_a_doubt(residuals, warnings, doubt):
+    given = {
+        "residuals": residuals and told().model_copy(update={"verdict": residuals}),
+        "warnings": [Warning(code, "text") for code in warnings],
+    }
+    large, small = (fit_verdict(fitted(0.01, error, **given)) for error in (0.22, 0.05))
+    assert small.level == "good"
+    assert large.level == ("care" if doubt else "good") and (doubt or "reliable") in large.trust
+
+
 def test_a_learner_that_was_tried_and_is_not_better_is_not_advised():
     both = told(LEARNER, LAG)
     assert fit_verdict(fitted(residuals=both)).then.startswith(

@@ -201,7 +201,6 @@ def test_draws_follow_their_seed(static):
 @pytest.mark.parametrize(
     ("change", "arguments", "words"),
     [
-        (("hidden = [3]", 'kind = "none"'), (), "has no learner that could take up"),
         ((), ("--draws", "0"), "`draws` must be a whole number from 1 to 10000; got 0"),
         ((), ("--choices", "-1"), "`choices` must be a whole number"),
         ((), ("--seed", "-1"), "`seed` must be a whole number"),
@@ -233,6 +232,16 @@ def test_bad_input_is_one_line(static, monkeypatch, change, arguments, words):
     assert words in done.err and done.err.count("\n") == 1, done.err
     assert Path("theirs/notes.txt").read_text() == "mine"
     assert not Path("new").exists() and not Path("orthaug-out").exists()
+
+
+def test_physics_alone_is_rehearsed_with_what_it_lacks(static):
+    static.write_text(SPEC.replace("hidden = [3]", 'kind = "none"'))
+    made = oa.recover(static, draws=4, choices=1, terms=["declared"])
+    result = made.result
+    bias = next(one.bias for one in result.parameters if one.name == "a")
+    assert bias == pytest.approx(0.5 * 3 / 5, abs=0.06)  # of u**3 along u, uniform in [-1, 1]
+    assert {one.kind for one in result.choices} == {"declared", "rows"}
+    assert "as large as the noise" in made.summary()
 
 
 def test_python_takes_the_job_and_says_what_is_wrong(static):

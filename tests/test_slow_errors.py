@@ -41,6 +41,10 @@ def test_standard_errors_suit_the_errors_unless_plain_ones_are_asked_for():
     assert fit.std[0] > 2 * plain.std[0]
     np.testing.assert_array_equal(fit.plain_std, plain.std)
     assert fit.diagnose().parameters[0].std == pytest.approx(fit.std[0], rel=1e-12)
+    found = plain.diagnose()
+    assert found.parameters[0].std == pytest.approx(plain.std[0], rel=1e-12)
+    (text,) = [one.text for one in found.warnings if one.code == "plain_standard_errors"]
+    assert "Newey" in text and f"{fit.std[0]:.2g} of " in text
     with pytest.raises(oa.InputError, match="standard_errors must be one of auto, plain"):
         oa.estimate(record, physics, learner=None, standard_errors="HC3")
 

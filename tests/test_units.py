@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from orthaug import Channel, Record, load_spec
+from orthaug import (
+    Channel,
+    InputError,
+    Motion,
+    Output,
+    PhysicalParameter,
+    Record,
+    State,
+    estimate,
+    linearize,
+    load_spec,
+)
 from orthaug.data.units import conversion, unit_faults
 from orthaug.data.wild import data_warnings
+from orthaug.reports.linear import LinearizeResult
+from orthaug.reports.linear_text import linear_text
 
 SPEC = """
 [data]
@@ -94,3 +110,56 @@ def test_one_signal_in_two_columns(noise, said):
     assert len(found) == said
     if said:
         assert "rpm is 9.5" in found[0] and "*rad_s" in found[0]
+
+
+def cooled(**given) -> Motion:
+    """A body that cools by a rate, in 1/min."""
+    given = {"unit": "1/min", "equation": "b*u - a*x", **given}
+    return Motion.from_equations(
+        states=[State("x", given["equation"], start="T")],
+        outputs=[Output("T", "x")],
+        inputs=["u"],
+        parameters=[
+            PhysicalParameter("a", 0.1, given["unit"], min=0),
+            PhysicalParameter("b", 2.0, given.get("other", "K/s"), min=0),
+        ],
+    )
+
+
+def minutes(**given) -> Record:
+    """Half-minute samples of a rate of 0.2 1/min."""
+    rng = np.random.default_rng(0)
+    u, x, found = np.repeat(rng.uniform(0, 2, 20), 10), 0.0, []
+    for value in u:
+        found.append(x)
+        x = 15 * value + (x - 15 * value) * math.exp(-0.1)
+    y = np.array(found) + 0.1 * rng.normal(size=200)
+    record = Record.from_arrays(u, y, outputs=["T"], sampling_time=given["step"])
+    return replace(record, time_column=given.get("column"))
+
+
+def test_a_rate_per_minute_is_refused_where_time_was_converted_to_seconds():
+    record = minutes(step=30.0, column="time [min]")
+    with pytest.raises(InputError, match=r"'a' has the unit 1/min.*\(0.001667\).* in 1/s"):
+        estimate(record, cooled(), learner=None)
+    with pytest.raises(InputError, match=r"'a' has the unit min.*\(6\).* in s"):
+        estimate(record, cooled(unit="min"), learner=None)
+    fit = estimate(record, cooled(equation="b*u/60 - a/60*x"), learner=None)
+    assert fit.parameters.loc["a", "value"] == pytest.approx(0.2, rel=0.02)
+
+
+def test_a_unit_with_minutes_in_it_is_named_as_not_converted():
+    record = minutes(step=30.0, column="time [min]")
+    fit = estimate(record, cooled(unit="1/s", other="K/min"), learner=None)
+    (found,) = [w for w in fit.diagnose().warnings if w.code == "time_unit"]
+    assert "the units of b have another time" in found.text
+
+
+def test_equations_in_minutes_have_linear_views_in_minutes():
+    fit = estimate(minutes(step=0.5), cooled(other="K/min"), learner=None)
+    assert fit.parameters.loc["a", "value"] == pytest.approx(0.2, rel=0.02)
+    found = linearize(fit)
+    text = linear_text(found)
+    assert "Ts = 0.5 min" in text and re.search(r"0\.(19|20)\d* 1/min", text)
+    assert re.search(r"time constant [\d.]+ min", text) and "Hz" not in text
+    assert json.loads(LinearizeResult.of(found).to_json())["points"][0]["time_unit"] == "min"

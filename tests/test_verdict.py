@@ -33,7 +33,7 @@ from orthaug.analysis.validation import (
     score_trial,
 )
 from orthaug.data.regressors import stack_rows
-from orthaug.fitting.held_out import held_out_blocks
+from orthaug.fitting.held_out import covered_folds, held_out_blocks
 from orthaug.fitting.status import Ending
 
 pytestmark = pytest.mark.usefixtures("without_figures")
@@ -362,7 +362,7 @@ def test_a_constant_output_is_not_taken_for_a_free_run_that_diverges():
 
 def validated(record, blocks=4, **options):
     fits = [lambda fold: fitted(fold), lambda fold: fitted(fold, **options)]
-    return cross_validate(record, fits, blocks=blocks, start=2)
+    return cross_validate(record, fits, folds=covered_folds(record, blocks, 2))
 
 
 def verdict(errors):
@@ -397,6 +397,37 @@ def test_a_learner_with_nothing_to_find_does_not_help(seed):
     assert verdict(validated(system(seed, 300, noise=0.3), **given)).code != "helps"
 
 
+def discharged(rows, curved=1.0):
+    """A cell whose state of charge sweeps its range once, so that no block holds another's."""
+    rng = np.random.default_rng(0)
+    current = np.repeat(rng.uniform(0.2, 1.8, rows // 10), 10)
+    current *= 0.95 * rows / current.sum()
+    charge = 0.97 - np.concatenate([[0], np.cumsum(current)[:-1]]) / rows
+    voltage = 3.5 + 0.35 * charge - 0.06 * current + 0.003 * rng.normal(size=rows)
+    voltage += curved * 0.08 * np.log(charge / (1.02 - charge))
+    both = np.column_stack([current, charge])
+    return Record.from_arrays(both, voltage, inputs=["I", "charge"], outputs=["v"])
+
+
+def of_charge(record):
+    terms = [Term("open", "1"), Term("slope", "charge[k]"), Term("R", "I[k]")]
+    learner = MLP(hidden=(4,), inputs=("charge[k]",))
+    fit = estimate(record, Baseline.from_terms(terms), learner=learner)
+    return fit.diagnose().validation
+
+
+def test_blocks_that_would_leave_the_range_of_the_other_rows_are_spread():
+    found = of_charge(discharged(400))
+    assert found.verdict == "helps"
+    assert "in charge[k], on 49 % of their rows" in found.text and "stretches" in found.text
+
+
+def test_blocks_that_cannot_be_spread_are_said_to_compare_extrapolations():
+    text = of_charge(discharged(120)).text
+    assert "The blocks leave the range of the other rows (in charge[k]" in text
+    assert "compares extrapolations" in text
+
+
 def test_several_experiments_are_cross_validated():
     record = Record.join([system(i, n, nonlinear=True) for i, n in enumerate((120, 80, 100))])
     found = verdict(validated(record, **SMALL))
@@ -411,7 +442,10 @@ def test_a_fit_that_fails_counts_as_a_free_run_that_diverges():
         fit = fitted(fold)
         return replace(fit, status=replace(fit.status, ending=Ending.NON_FINITE))
 
-    errors = cross_validate(system(0, 120), [fitted, refused, non_finite], blocks=2, start=2)
+    record = system(0, 120)
+    errors = cross_validate(
+        record, [fitted, refused, non_finite], folds=covered_folds(record, 2, 2)
+    )
     for fit in (1, 2):
         assert all(
             0 < trial.alone < 1 and trial.model == INF for trial in block_trials(errors, fit)
@@ -420,7 +454,7 @@ def test_a_fit_that_fails_counts_as_a_free_run_that_diverges():
 
 def test_too_few_rows_are_refused_before_any_fit():
     with pytest.raises(InputError, match="40 rows are too few for 4 blocks"):
-        cross_validate(system(0, 40), [lambda fold: pytest.fail("fitted")], blocks=4, start=2)
+        covered_folds(system(0, 40), 4, 2)
 
 
 # --- a learner that leaves the training range

@@ -24,15 +24,17 @@ _DAMPED = 0.005  # change of a damping ratio that is too small to be reported
 
 
 class _Mode(NamedTuple):
-    """A pole in continuous time by its frequency |s| [1/s] and its damping ratio."""
+    """A pole in continuous time by its frequency |s| and its damping ratio."""
 
     frequency: float
     damping: float
 
-    def __str__(self) -> str:
+    def describe(self, time_unit: str) -> str:
+        """Return the pole in words, its frequency in the unit of time."""
         if abs(self.damping) >= 1 - 1e-9:
-            return f"a real pole at {-np.sign(self.damping) * self.frequency:.3g} 1/s"
-        return f"damping {self.damping:.2g} at {self.frequency / (2 * np.pi):.3g} Hz"
+            return f"a real pole at {-np.sign(self.damping) * self.frequency:.3g} 1/{time_unit}"
+        unit = "Hz" if time_unit == "s" else f"1/{time_unit}"
+        return f"damping {self.damping:.2g} at {self.frequency / (2 * np.pi):.3g} {unit}"
 
 
 def amplitude_warnings(
@@ -43,6 +45,7 @@ def amplitude_warnings(
     poles: tuple[Pole, ...],
     deviation: Vector,
     moving: Vector,
+    time_unit: str,
 ) -> list[Warning]:
     """Return a warning where the poles at the amplitude of the training data are others.
 
@@ -54,6 +57,7 @@ def amplitude_warnings(
         poles: of the view.
         deviation: standard deviations of the training outputs (ny,).
         moving: those of the inputs (nu,), 0 where they are unknown.
+        time_unit: of the sampling time.
     """
     step, system = search.step, sampled if own is None else own
     if not step.form.differentiable or not len(sampled.modes.values):
@@ -86,7 +90,8 @@ def amplitude_warnings(
     ]
     if not changed:
         return []
-    _, one, other = max(changed)
+    _, *both = max(changed)
+    one, other = (mode.describe(time_unit) for mode in both)
     text = (
         "the linear system depends on the amplitude: at the root-mean-square amplitude of the "
         f"training outputs it has {other}, at the operating point {one}. The system given holds "

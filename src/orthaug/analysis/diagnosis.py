@@ -182,6 +182,11 @@ def _of_motion(
     names = ([c.name for c in record.outputs], list(motion.external), list(motion.names_of_states))
     with one_blas_thread():
         tests = analyse(errors, inputs, states, *names, lags=LAGS)
+        if (
+            not record.complete and coarse is None
+        ):  # as scores have it: of all rows with this output
+            pairs = zip(tests, rms_errors(free_run), strict=True)
+            tests = tuple(replace(test, rms=float(rms)) for test, rms in pairs)
         shares = tuple(_predictable(i, test, errors, inputs) for i, test in enumerate(tests))
         missing = missing_terms(fit) if coarse is None else None
         if coarse is not None and any(test.white is None for test in tests):

@@ -33,8 +33,8 @@ F = TypeVar("F", bound=Findings)
 
 _LISTED = 3  # parameters, and terms with memory
 NOISE_ONLY = (
-    *("unexplained", "parameter_drift", "parameter_by_experiment", "quantised_output"),
-    "explains_nothing",
+    *("unexplained", "parameter_drift", "parameter_depends", "parameter_by_experiment"),
+    *("quantised_output", "explains_nothing"),
     *("few_frequencies", "little_left", "output_without_learner", "hidden_state"),
 )
 """Codes of warnings that leave intervals of noise alone."""
@@ -93,8 +93,8 @@ def doubt(made: E) -> E:
     hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
     if test is not None and test.state is not None and _named_share(result) > _MOSTLY:
         hidden = hidden and test.state.share > _LITTLE_BESIDE * _named_share(result)
-    stepped = test is not None and test.drift is not None and bool(test.drift.each)
-    hidden = hidden and not stepped
+    drift = None if test is None else test.drift
+    hidden = hidden and not (drift and (drift.each or drift.on))
     if test is not None and hidden:
         warnings.append(Warning(code="hidden_state", text=_hidden_state(fit, test)))
     if test is not None and test.drift is not None and not hidden:
@@ -378,6 +378,14 @@ def _drifting(fit: Any, drift: ParameterDrift) -> list[Warning]:
             f"state, dz/dt = ({what.on} - z)/{what.scale:.3g}, and {name} as a function of z."
         )
         return [Warning("hidden_state", text)]
+    if drift.on:
+        values = zip((ends[0], ends[2], ends[1]), drift.at, strict=True)
+        listed = ", ".join(f"{value:.3g} where that is {at:.3g}" for value, at in values)
+        text = (
+            f"{name} seems to depend on {drift.on}: {name} is about {listed}, {share}. Its value "
+            f"is a mean. Write {name} as a function of {drift.on} into the physics."
+        )
+        return [Warning("parameter_depends", text)]
     between = "" if drift.turn is None else f"over {ends[2]:.3g} in between "
     text = (
         f"{name} seems to change over the record: from {ends[0]:.3g} at its begin {between}to "

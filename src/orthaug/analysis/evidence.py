@@ -31,7 +31,8 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.models.learners import Learner, declared
 from orthaug.models.rows import InMemory
 from orthaug.models.tasks import runs_on
-from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.motion import Motion
+from orthaug.physics.parameters import PhysicsMap, check_time_units
 from orthaug.physics.problem import MotionProblem, PosedProblem, Problem
 
 if TYPE_CHECKING:
@@ -159,6 +160,7 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
     found = _unread(problem)
     if isinstance(problem, Problem):
         return [*found, *data_warnings(problem.record, partial(fit_without, problem))]
+    found += _other_times(problem.motion, problem.record.time_column)
     set_by_controller = problem.motion.held if isinstance(problem, MotionProblem) else ()
     return [*found, *data_warnings(problem.record, limited=set_by_controller)]
 
@@ -174,6 +176,19 @@ def _unread(problem: PosedProblem) -> list[Warning]:
         f"learner, or remove {'it' if one else 'them'} from `data.inputs`."
     )
     return [Warning("unread_input", text)]
+
+
+def _other_times(motion: Motion, column: str | None) -> list[Warning]:
+    """Return a warning on parameters whose units have another time than the equations."""
+    names = check_time_units(motion, column)
+    if not names:
+        return []
+    text = (
+        f"equations are per second, because the instants of column '{column}' are read in "
+        f"seconds. But the units of {join_words(names)} have another time, which is not converted: "
+        "the values are those with s. Give these units with s."
+    )
+    return [Warning("time_unit", text)]
 
 
 def _problem_of(fit: Estimate) -> Any:

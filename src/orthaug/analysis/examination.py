@@ -20,7 +20,7 @@ from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores, parameter_rows
 from orthaug.analysis.informative_data import explains_nothing, few_frequencies
 from orthaug.analysis.physics_findings import analyse_physics, describe_physics, imitable
-from orthaug.analysis.robustness import robust_where_asked
+from orthaug.analysis.robustness import beside_plain, robust_where_asked
 from orthaug.analysis.scoring import score_part
 from orthaug.analysis.trained_start import from_trained_start, local_minimum_of_start
 from orthaug.analysis.validation import (
@@ -40,6 +40,7 @@ from orthaug.data.scales import describe_scales
 from orthaug.fitting.criteria import Prediction
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.estimation import fit as train
+from orthaug.fitting.held_out import covered_folds
 from orthaug.fitting.status import Status
 from orthaug.inference.learned_terms import equation, learned_terms
 from orthaug.inference.over_experiments import differing_warning
@@ -188,9 +189,16 @@ def _analyse(
     budget = None
     if fit.status.ok:
         plain, (one_step, free_run) = fit, responses[evidence.train.name]
+        asked = "auto" if fit.setup is None else fit.setup.standard_errors
         fit = attempt(
-            "the robust covariance", lambda: robust_where_asked(plain, one_step), warnings, plain
+            "the robust covariance",
+            lambda: robust_where_asked(plain, one_step, ordered=asked != "unordered"),
+            warnings,
+            plain,
         )
+        if asked == "plain":
+            warnings += beside_plain(fit, plain)
+            fit = plain
         # Wider errors may leave a parameter without an interval
         gone = [one for one in plain.warnings if one not in fit.warnings]
         warnings[:] = [one for one in warnings if one not in gone]
@@ -516,9 +524,10 @@ def cross_validated(evidence: Evidence, blocks: int, fits: Sequence[Any]) -> lis
         setup.fold_fit(criterion, physics_only=True),
         *(fit.setup.fold_fit(fit.criterion) for fit in fits),
     ]
+    record = evidence.train.record
     try:
-        options: dict[str, Any] = {"start": evidence.problem.first_row, "runner": evidence.runner}
-        errors = cross_validate(evidence.train.record, folds, blocks=blocks, **options)
+        cut = covered_folds(record, blocks, evidence.problem.first_row, fits[0].model)
     except InputError:
         return [[] for _ in fits]
-    return [block_trials(errors, 1 + j) for j in range(len(fits))]
+    errors = cross_validate(record, folds, folds=cut, runner=evidence.runner)
+    return [block_trials(errors, 1 + j, cut.note) for j in range(len(fits))]

@@ -153,11 +153,13 @@ class MissingTermResult(Placed, Content):
     `equation` is None of one of an `output`, and of one that acts as the input `beside` does.
     """
 
-    absent = frozenset({"beside"})
+    absent = frozenset({"beside", "saturates"})
 
     equation: str | None
     output: str | None = None
     beside: str | None = None
+    saturates: Number | None = None
+    """The size at which the variable, an input, seems to saturate."""
     variable: str | None
     shape: str
     coefficient: Number

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -36,8 +37,10 @@ from orthaug.analysis.memory import KINDS, memory_terms
 from orthaug.analysis.output_response import LinearRun, linear_runs
 from orthaug.analysis.parameter_changes import (
     CLEARLY,
+    Alternatives,
     ParameterDrift,
     changing_columns,
+    depending_columns,
     find_change,
 )
 from orthaug.data.record import Record
@@ -94,7 +97,7 @@ class StructureTest:
     drift: ParameterDrift | None = None
     """The parameter that changes over the record, if that predicts more than any term.
 
-    Where it follows the square of a signal, a state is missing that changes the parameter.
+    Where it follows the slow past of a signal's square, a state is missing that changes it.
     """
     delayed: tuple[str, ...] = ()
     """Signals whose short memory is a lag or a delay that is missing, and no state."""
@@ -172,7 +175,8 @@ def structure_test(
     own = _base_columns(model, runs)
     recordings = record.recordings if by_experiment else ()
     added = _added_columns(model, runs, recordings)
-    found = _structure_of(Candidates(runs, own, *added, moved))
+    depending = partial(depending_columns, model, runs, *_common_signals(model, runs))
+    found = _structure_of(Candidates(runs, own, *added, moved), depending)
     if found is None:
         return None
     delayed = tuple(_equations(model).delayed(runs[0]))
@@ -249,6 +253,14 @@ def _signals(model: Model, run: LinearRun) -> dict[str, Vector]:
         if np.isfinite(row).all() and np.ptp(row) > 0
     }
     return dict(list(moving.items())[:_VARIABLES])
+
+
+def _common_signals(
+    model: Model, runs: list[LinearRun]
+) -> tuple[list[str], list[dict[str, Vector]]]:
+    """Return the names of signals that move in every run, and each run's signals."""
+    signals = [_signals(model, run) for run in runs]
+    return [name for name in signals[0] if all(name in other for other in signals)], signals
 
 
 def _lags_read(model: Any, run: LinearRun) -> Matrix:
@@ -438,8 +450,7 @@ def _added_columns(
     model: Model, runs: list[LinearRun], recordings: Sequence[int]
 ) -> tuple[list[Family], list[np.ndarray]]:
     """Return the families of terms, and each run's responses to all their terms, (T, ny, K)."""
-    step, signals = model.sampling_time, [_signals(model, run) for run in runs]
-    names = [name for name in signals[0] if all(name in other for other in signals)]
+    step, (names, signals) = model.sampling_time, _common_signals(model, runs)
     families, columns = [], [[] for _ in runs]
     for name in names:
         joined = np.concatenate([own[name] for own in signals])
@@ -462,8 +473,13 @@ def _added_columns(
     return families, [np.concatenate(found, axis=2) for found in columns]
 
 
-def _structure_of(candidates: Candidates) -> StructureTest | None:
-    """Return the best of all families, each beside what the model has."""
+def _structure_of(candidates: Candidates, depending: Alternatives) -> StructureTest | None:
+    """Return the best of all families, each beside what the model has.
+
+    Args:
+        candidates: families of terms, and of changing parameters.
+        depending: gives the families of parameters that depend on a signal.
+    """
     tests = candidates.test()
     if tests is None:
         return None
@@ -480,4 +496,4 @@ def _structure_of(candidates: Candidates) -> StructureTest | None:
         best_family([entry for entry in tests.hidden if entry.kind in KINDS]),
         tuple(by_share(memory)),
     )
-    return replace(found, drift=find_change(candidates, tests, [static, found.memory]))
+    return replace(found, drift=find_change(candidates, tests, [static, found.memory], depending))

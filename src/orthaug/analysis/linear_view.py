@@ -134,6 +134,13 @@ class LinearView:
     """True if inputs run smoothly between samples (a spline), so that `bode` is the response of the
     equations.
     """
+    time_unit: str = "s"
+    """Of the sampling time, and of all rates and frequencies: another where the equations are."""
+
+    @property
+    def frequency_unit(self) -> str:
+        """Unit of `Pole.hertz` and of the frequencies of `bode`."""
+        return "Hz" if self.time_unit == "s" else f"1/{self.time_unit}"
 
     @property
     def responding(self) -> System:

@@ -27,6 +27,7 @@ from orthaug.analysis.operating_points import OperatingPoint, Search, operating_
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.model import Model
+from orthaug.physics.parameters import time_unit
 
 _POINTS = 400  # of the frequency grid
 _DECADES = 3  # below Nyquist's frequency at least
@@ -210,8 +211,11 @@ def _view(
     else:
         found = convert_to_continuous(sampled, method, step.memory, names)
     poles = poles_of(sampled, own, freedom)
+    unit = time_unit((one.unit for one in model.estimated[0]), model.time_column)
     if not warnings or warnings[0].code != "kink":
-        warnings += amplitude_warnings(search, point, sampled, own, poles, model.deviation, moving)
+        warnings += amplitude_warnings(
+            search, point, sampled, own, poles, model.deviation, moving, unit
+        )
     if any(
         pole.magnitude_ci95 and pole.magnitude_ci95[0] < 1 < pole.magnitude_ci95[1]
         for pole in poles
@@ -231,7 +235,7 @@ def _view(
     outputs = tuple(channel.name for channel in model.outputs)
     modes = sampled.modes.at_zero
     seen = (point, sampled, found, poles, modes, gain, gain_ci95, bode, names, step.inputs, outputs)
-    return LinearView(*seen, units, freedom, tuple(warnings), smooth)
+    return LinearView(*seen, units, freedom, tuple(warnings), smooth, unit)
 
 
 def _system(

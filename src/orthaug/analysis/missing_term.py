@@ -84,7 +84,8 @@ class MissingTerm(Placed):
     output: str | None = None
     against: str | None = None
     """What the term acts against: "movement" where it slows its variable down, "displacement"
-    where it drives that back by way of its derivative; None where it does neither.
+    where it drives that back by way of its derivative, "input" where it takes from what an input
+    does beyond a size; None where it does neither.
     """
     beside: str | None = None
 
@@ -92,6 +93,11 @@ class MissingTerm(Placed):
     def variables(self) -> tuple[str, ...]:
         """States and inputs that the term depends on."""
         return self.factors or (() if self.variable is None else (self.variable,))
+
+    @property
+    def saturates(self) -> float | None:
+        """The size at which its variable, an input, saturates; None where it does not."""
+        return self.width if self.against == "input" else None
 
     @property
     def term(self) -> str:
@@ -121,6 +127,9 @@ class MissingTerm(Placed):
         """Its kind in words."""
         if self.width is not None:
             place = f"about |{self.variable}| = {self.width:.3g}"
+            if self.saturates is not None:
+                limit = f"{'' if self.one_sided else '±'}{self.width:.3g}"
+                return f"that begins at {place}, as where the input saturates at {limit}"
             return f"that begins at {place}, as a saturation, an end stop or a gap"
         words = _ONE_SIDED if self.one_sided else _MEANINGS
         if self.reference is not None and self.shape == "linear":

@@ -64,6 +64,7 @@ _LESS = 0.6
 # a damper the right sign has nearly the same effect, and a cubic spring is nearly a square one
 _UNLIKELY = 0.8
 _ELSEWHERE = 0.97  # of its gain: friction is where the movement is that it follows
+_TAKEN = (0.5, 2.0)  # of what an input does beyond a size: the same but for biased parameters
 _CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
@@ -256,7 +257,8 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     for place, term in named:
         if term.shape in (BEYOND, "cube", "drag") and term.reference is None:
             best = _finer(fit, tried, equations[place], term)
-            best = term if best is None and term.shape == BEYOND else best
+            if best is None and term.shape == BEYOND:
+                best = replace(term, against=_against_input(fit, equations[place], term))
             listed = listed if best is None else _with_finer(listed, best)
             break
     return MissingTest(p, freedom, share, tuple(listed))
@@ -345,7 +347,28 @@ def _finer(
         output=term.output,
         beside=term.beside,
     )
+    best = replace(best, against=_against_input(fit, equation, best))
     return best if best.share > term.share else None
+
+
+def _against_input(fit: MotionEstimate, equation: int, term: MissingTerm) -> str | None:
+    """Return "input" of a term that takes from what an input does beyond a size; else None.
+
+    A saturation takes all of it, as far as parameters that it has biased show.
+    """
+    motion = fit.problem.motion
+    nx, ny = len(motion.states), len(motion.outputs)
+    if term.variable not in motion.inputs or nx <= equation < nx + ny:
+        return None
+    number = motion.inputs.index(term.variable) + nx + ny
+    if equation >= nx + ny:
+        gain = float(equation == number)
+    else:
+        gain = float(np.median(_acting(fit, number)[:, equation]))
+    low, high = _TAKEN
+    return (
+        "input" if low * abs(gain) < -np.sign(gain) * term.coefficient < high * abs(gain) else None
+    )
 
 
 def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, ...]]:

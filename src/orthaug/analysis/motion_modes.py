@@ -23,7 +23,7 @@ from orthaug.data.record import Record
 from orthaug.models.dynamics import Numbers
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
-from orthaug.physics.parameters import rate_unit
+from orthaug.physics.parameters import time_unit
 
 _LARGEST = 1024.0  # factor on the inputs that is tried
 _POINTS = 2000  # at most
@@ -104,7 +104,8 @@ def _of_modes(model: Model[MotionDynamics], x: Matrix, u: Matrix) -> MotionStabi
     held = model.form.motion.held
     subject = "the closed loop" if held else "the motion"
     linear = "linearised closed loop" if held else "linearised motion"
-    rate = rate_unit(parameter.unit for parameter in model.form.motion.parameters)
+    units = [parameter.unit for parameter in model.form.motion.parameters]
+    rate = f"1/{time_unit(units, model.time_column)}"
     text = f"The {linear} has {_sizes(found, rate)} along the free run. "
     if not found.growing:
         return MotionStability(found, (), text + _without_growth(found, rate))

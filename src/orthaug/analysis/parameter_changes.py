@@ -7,8 +7,8 @@ are families of terms beside all others (`family_tests`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,10 @@ CLEARLY = 0.1
 """Share by which one cause predicts clearly more than another."""
 
 _DRIFT, _SCHEDULED, _STEPPED = _CHANGES = "drift", "scheduled", "stepped"
+_DEPENDING = "depending"
+
+Alternatives = Callable[[], tuple[list[Family], list[np.ndarray]]]
+"""Gives families of terms, and each run's responses to all their terms (T, ny, K)."""
 _MOST_EXPERIMENTS = 6  # of more, a block of held-out rows may be all that one has
 # Time constants, in samples, of what a parameter may follow; rows from which on it is looked for
 _SLOW, _SLOW_ROWS = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0), 1000
@@ -51,6 +55,11 @@ class ParameterDrift:
     """The difference where the curve turns, where that is far beyond both ends; None elsewhere."""
     each: tuple[float, ...] = ()
     """The differences in each experiment, where it has a value of its own in each."""
+    on: str = ""
+    """The signal of which it is a function of the second degree. `begin`, `turn` and `end` are then
+    at its least value, in the middle and at its largest, `at`.
+    """
+    at: tuple[float, ...] = ()
 
 
 def changing_columns(
@@ -109,6 +118,34 @@ def _scheduled_columns(
     return families, columns
 
 
+def depending_columns(
+    model: Model,
+    runs: list[LinearRun],
+    names: list[str],
+    signals: list[dict[str, Vector]],
+) -> tuple[list[Family], list[np.ndarray]]:
+    """Return families of parameters that depend on a signal, and the responses of every run.
+
+    A gain that falls with a stroke is such a function, of the second degree here. It follows the
+    short past of the stroke's square nearly as well.
+
+    Args:
+        names: of the signals.
+        signals: of every run, by name.
+    """
+    count, families, columns = len(model.numbers.theta), [], [[] for _ in runs]
+    for name in names:
+        joined = np.concatenate([own[name] for own in signals])
+        low, high = float(joined.min()), float(joined.max())
+        families += [
+            Family(name, str(i), _DEPENDING, (None, None), ((low, high),)) for i in range(count)
+        ]
+        for found, run, own in zip(columns, runs, signals, strict=True):
+            scaled = (2 * own[name] - low - high) / (high - low)
+            found.append(_changes(run, np.stack([scaled, scaled**2], axis=1)))
+    return families, [np.concatenate(found, axis=2) for found in columns]
+
+
 def _drift_columns(
     count: int, runs: list[LinearRun]
 ) -> tuple[list[Family], list[list[np.ndarray]]]:
@@ -146,7 +183,10 @@ def _changes(run: LinearRun, over_time: Matrix) -> np.ndarray:
 
 
 def find_change(
-    candidates: Candidates, tests: Tests, others: list[FamilyTest | None]
+    candidates: Candidates,
+    tests: Tests,
+    others: list[FamilyTest | None],
+    depending: Alternatives,
 ) -> ParameterDrift | None:
     """Return the change of a parameter that predicts more than all other terms; None without one.
 
@@ -154,6 +194,7 @@ def find_change(
         candidates: what was tested, changing parameters among it.
         tests: their tests.
         others: the best terms of other kinds.
+        depending: gives the families of parameters that depend on a signal.
     """
     known = [one.share for one in others if one is not None]
     stepped = _look(tests, _STEPPED) or _look_again(candidates, tests, _STEPPED)
@@ -169,7 +210,36 @@ def find_change(
     shares = known if drift is None else [*known, drift.share]
     if slow is not None and slow.share > (1 + CLEARLY) * max(shares, default=0.0):
         drift = slow
-    return None if drift is None else _change_of(candidates, drift.tests, drift.best)
+    if drift is None or drift is not slow:
+        return None if drift is None else _change_of(candidates, drift.tests, drift.best)
+    return _without_past(candidates, slow, depending)
+
+
+def _without_past(
+    candidates: Candidates, slow: _Seen, depending: Alternatives
+) -> ParameterDrift | None:
+    """Return the change of a parameter that seems to follow the slow past of a signal.
+
+    It is one where functions of the present, and memory of other kinds, predict clearly less in
+    the same rows. Else it is the parameter that depends on a signal, if that predicts most.
+    """
+    families, columns = depending()
+    both = replace(
+        candidates,
+        families=[*candidates.families, *families],
+        added=[
+            np.concatenate(pair, axis=2) for pair in zip(candidates.added, columns, strict=True)
+        ],
+    )
+    tests = both.test(slow.best)
+    if tests is None:
+        return None
+    same = (slow.best.on, slow.best.kind)
+    own = max((one.share for one in tests.beside if (one.on, one.kind) == same), default=0.0)
+    other = best_family([one for one in tests.beside if one.kind not in _CHANGES])
+    if other is None or own > (1 + CLEARLY) * other.share:
+        return _change_of(candidates, slow.tests, slow.best)
+    return _change_of(both, tests, other) if other.kind == _DEPENDING else None
 
 
 @dataclass(frozen=True)
@@ -256,6 +326,11 @@ def _change_of(candidates: Candidates, tests: Tests, best: FamilyTest) -> Parame
     if best.term is None:
         linear, square = moved
         ends = middle - linear + square, middle + linear + square
+        if best.kind == _DEPENDING:
+            low, high = family.ranges[0]
+            values = tuple(map(float, (*ends, middle)))
+            on = {"on": best.equation, "at": (low, (low + high) / 2, high)}
+            return ParameterDrift(place, best.share, *values[:2], turn=values[2], **on)
         turn = _turn_of(float(middle), float(linear), float(square))
     else:
         low, high = family.ranges[chosen[0]]

@@ -13,7 +13,7 @@ from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.residuals import LAGS, PRACTICALLY_WHITE, ROUNDING, errors_of, rms_errors
 from orthaug.fitting.colour import correlation_length
-from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.estimates import STD_KINDS, Estimate
 from orthaug.fitting.whiteness import ROWS_PER_LAG, autocorrelation, ljung_box
 from orthaug.inference.influence import LARGEST, Influence, one_step_slopes
 from orthaug.models.response import Response
@@ -100,6 +100,26 @@ def robust_where_asked(fit: Estimate, response: Response, *, ordered: bool = Tru
     ):
         return fit
     return _robust(fit, None, "hc3")
+
+
+def beside_plain(robust: Estimate, plain: Estimate) -> tuple[Warning, ...]:
+    """Return a warning on the standard errors that would suit a fit, where plain ones are asked.
+
+    None where these suit.
+    """
+    if robust.std_kind == plain.std_kind:
+        return ()
+    begin = 'standard errors are plain, as asked (`standard_errors="plain"`). '
+    if robust.std is None:
+        text = f"{begin}None would suit: the errors are correlated over too many steps."
+        return (Warning("plain_standard_errors", text),)
+    listed = ", ".join(
+        f"{std:.2g} of {name}"
+        for name, std in zip(plain.problem.names, robust.std, strict=True)
+        if np.isfinite(std)
+    )
+    text = f"{begin}Those that suit these errors are {STD_KINDS[robust.std_kind]}: {listed}."
+    return (Warning("plain_standard_errors", text),)
 
 
 def robust_free_run(fit: Estimate) -> Estimate:

@@ -18,10 +18,10 @@ from orthaug.data.record import Record
 from orthaug.data.regressors import Layout
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.held_out import (
+    Folds,
     HeldOutErrors,
     Pieces,
     Ratio,
-    held_out_blocks,
     mean_square,
     squared_errors,
 )
@@ -44,7 +44,7 @@ class Trial:
 
     `block` is true for a block of cross-validation, and false for a part of its own. `pieces` holds
     the squared errors along the runs, of physics alone and of the model, for the uncertainty of
-    their ratio.
+    their ratio. `note` says of blocks that they leave the range of the other rows.
     """
 
     where: str
@@ -52,6 +52,7 @@ class Trial:
     model: float
     block: bool = False
     pieces: tuple[Pieces, Pieces] | None = field(default=None, compare=False, repr=False)
+    note: str = field(default="", compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -147,43 +148,36 @@ def trials_of(held_out: HeldOutErrors) -> list[Trial]:
     chosen, trials = held_out.runs[held_out.chosen], []
     for label in dict.fromkeys(held_out.labels):
         own = [i for i, other in enumerate(held_out.labels) if other == label]
-        trials.append(_trial(label, [held_out.alone[i] for i in own], [chosen[i] for i in own]))
+        pieces = [held_out.alone[i] for i in own], [chosen[i] for i in own]
+        trials.append(_trial(label, *pieces, held_out.note))
     return trials
 
 
-def _trial(label: str, alone: Pieces, model: Pieces) -> Trial:
+def _trial(label: str, alone: Pieces, model: Pieces, note: str) -> Trial:
     """Return a trial of squared errors, in deviations of the training output."""
     block = label.startswith("block ")
-    return Trial(
-        label, math.sqrt(mean_square(alone)), math.sqrt(mean_square(model)), block, (alone, model)
-    )
+    errors = math.sqrt(mean_square(alone)), math.sqrt(mean_square(model))
+    return Trial(label, *errors, block, (alone, model), note)
 
 
 def cross_validate(
     record: Record,
     fits: Sequence[Callable[[Record], Estimate]],
     *,
-    blocks: int,
-    start: int,
+    folds: Folds,
     runner: Any = Threads(),  # noqa: B008  (it holds nothing)
 ) -> list[list[Pieces]]:
     """Return squared free-run errors of every fit on every held-out block, in training deviations.
 
     Args:
         fits: each fits a training record; a failed training counts as runs that diverge.
-        start: rows at the beginning of an experiment without a prediction.
+        folds: of the record.
         runner: makes the fits of each block; an `Engine`, or `Threads()`.
 
     Returns:
         For every block the errors of every fit.
-
-    Raises:
-        InputError: too few rows for so many blocks.
     """
-    folds = held_out_blocks(record, blocks, start)
-    unit = record.deviation
-
-    return list(runner.map(_on_block, (tuple(fits), unit), folds))
+    return list(runner.map(_on_block, (tuple(fits), record.deviation), folds.pairs))
 
 
 def _on_block(given: Any, pair: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
@@ -201,10 +195,14 @@ def _on_block(given: Any, pair: tuple[Record, Record], report: Callable[..., Non
     return errors
 
 
-def block_trials(errors: Sequence[Sequence[Pieces]], fit: int) -> list[Trial]:
-    """Return the trials of one fit against the first one, from `cross_validate`."""
+def block_trials(errors: Sequence[Sequence[Pieces]], fit: int, note: str = "") -> list[Trial]:
+    """Return the trials of one fit against the first one, from `cross_validate`.
+
+    Args:
+        note: on the folds.
+    """
     return [
-        _trial(f"block {i + 1} of {len(errors)}", block[0], block[fit])
+        _trial(f"block {i + 1} of {len(errors)}", block[0], block[fit], note)
         for i, block in enumerate(errors)
     ]
 
@@ -255,7 +253,8 @@ def judge(trials: Sequence[Trial], extrapolation: Sequence[Extrapolation] = ()) 
         if worst == "helps"
         else [s for s, c in zip(sentences, codes, strict=True) if c != "helps"]
     )
-    text = ". ".join([opening, *reasons]) + "."
+    notes = dict.fromkeys(t.note for t in trials if t.note)
+    text = " ".join([". ".join([opening, *reasons]) + ".", *notes])
     return Verdict(worst, text, tuple(trials), tuple(extrapolation), ratio)
 
 

@@ -31,6 +31,7 @@ from orthaug.commands.spec import spec_model
 from orthaug.data.preparation import prepare
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
+from orthaug.reports.page_verdict import is_biased_by_feedback
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
@@ -46,6 +47,11 @@ _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no b
 _LARGE_GAIN = 3.0  # times the error: what lowers it by more may only have led to other values
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
 _ALIKE = 0.95  # of an error: a step of preparation, which adds no parameter, is named first above
+_LOOP_FIRST = (
+    "First mend the feedback, as its warning says: disturbances that are fed back leave errors "
+    "like those of a missing term. "
+)
+_IF_LEFT = "If errors remain without it"
 _CHANCE = (
     " It may be chance: the errors remember each other over much of the record, so that few are "
     "independent."
@@ -288,7 +294,9 @@ def _tried(
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings
     )
-    return _conclude_trials(base, tried, rows, len(found) - len(chosen), learns, slow=slow)
+    looped = is_biased_by_feedback(result)
+    left = len(found) - len(chosen)
+    return _conclude_trials(base, tried, rows, left, learns, slow=slow, looped=looped)
 
 
 def _untried(one: Proposal) -> AdviceResult:
@@ -305,11 +313,13 @@ def _conclude_trials(
     learns: bool,
     *,
     slow: bool,
+    looped: bool = False,
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     """Return the changes that help, and a text on all that were tried.
 
     Args:
         slow: whether errors remember each other for so long that few of them are independent.
+        looped: whether feedback biases the fit, and what it seems to lack with it.
     """
     before = math.sqrt(mean_square(base))
     helps = [one for one in tried if _helps(one, base)]
@@ -320,7 +330,7 @@ def _conclude_trials(
     advice = [
         AdviceResult(
             change=one.proposal.change,
-            text=_advice_text(one, _before(one, base), rows)
+            text=_advice_text(one, _before(one, base), rows, looped=looped)
             + (_CHANCE if slow and one is better[0] and _may_be_chance(one, before) else ""),
             before=_before(one, base),
             after=one.error,
@@ -347,6 +357,9 @@ def _conclude_trials(
         text += (
             f" {plural(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save time."
         )
+    if looped and advice and advice[0].text.startswith(_IF_LEFT):
+        first = advice[0].model_copy(update={"text": f"{_LOOP_FIRST}{advice[0].text}"})
+        advice = [first, *advice[1:]]
     return advice, AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
 
 
@@ -405,10 +418,12 @@ def _may_be_chance(one: ProposalErrors, before: float) -> bool:
     return one.proposal.ahead is None and one.error > _HALVED * before
 
 
-def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows) -> str:
+def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows, *, looped: bool) -> str:
     alone = " of physics alone" if one.physics_only else ""
-    beside = "Training ended beside a better solution. " if one.proposal.restarts else ""
-    text = f"{beside}With {one.proposal.words} the free run{alone} on {rows.where}"
+    begin = "Training ended beside a better solution. With" if one.proposal.restarts else "With"
+    if looped and one.proposal.step is None and not one.proposal.restarts:
+        begin = f"{_IF_LEFT}, with"
+    text = f"{begin} {one.proposal.words} the free run{alone} on {rows.where}"
     if math.isinf(before):
         return (
             f"{text} no longer diverges: its error is {_error(one.error)} of the output's "

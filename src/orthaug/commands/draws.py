@@ -103,11 +103,6 @@ def plan_for(job: Job, asked: Asked) -> Plan:
     Raises:
         InputError, TrainingError: as `rehearse`.
     """
-    if job.spec.declared_learner() is None:
-        raise InputError(
-            f"{job.path}: has no learner that could take up a missing term. Add a [learner] with "
-            "its `inputs`; beside a motion also `learned = true` to the equation that may lack one."
-        )
     if job.train.source is not None:
         raise InputError(
             f"{job.path}: a rehearsal simulates the rows in memory, and these remain in their "
@@ -336,12 +331,14 @@ def _choices(
     """Yield kind and name of every other choice, and what fits it."""
     criterion, spec = fit.criterion, job.spec
     job = replace(job, spec=_changed(job, _ONE_START))
-    yield "structure", PHYSICS_ONLY, lambda: job.run(Variant(PHYSICS_ONLY, criterion=criterion))
-    for kind in job.physics.structures:
+    learns = spec.declared_learner() is not None  # else there is no structure to choose
+    if learns:
+        yield "structure", PHYSICS_ONLY, lambda: job.run(Variant(PHYSICS_ONLY, criterion=criterion))
+    for kind in job.physics.structures if learns else ():
         if kind != spec.structure.kind and job.refusal(Variant(kind)) is None:
             yield "structure", kind, lambda k=kind: job.run(Variant(k, criterion=criterion))
     declared = spec.declared_structure()
-    if declared.projects and _shares_some(job, fit):
+    if learns and declared.projects and _shares_some(job, fit):
         other = "all" if declared.shared == "auto" else "auto"
         words = "orthogonal to all of θ" if other == "all" else "orthogonal along shared directions"
         yield "structure", words, lambda: _run_changed(job, {"structure.shared": other}, criterion)
@@ -349,7 +346,7 @@ def _choices(
         for measure in (Training(), Symmetrized(), Uniform()):
             if measure.name != job.measure.name:
                 yield "measure", measure.name, lambda m=measure: fit.split(m)
-    for other in plan.system.other_inputs() if not _is_of_terms(job) else ():
+    for other in plan.system.other_inputs() if learns and not _is_of_terms(job) else ():
         change = {"learner.inputs": list(other.inputs)}
         names = ", ".join(other.inputs)
         yield "inputs", names, lambda c=change: _run_changed(job, c, criterion)

@@ -24,6 +24,7 @@ from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.folder import PHYSICS
 from orthaug.commands.job import AS_DECLARED, Job, Variant, origin_of
 from orthaug.fitting.estimates import Estimate
+from orthaug.reports.page_verdict import is_biased_by_feedback
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ def with_advice(fitted: FitReport) -> FitReport:
     )
     advice, tried = ([], None) if found is None else found
     result = fitted.result
-    if advice and _explains_more_than(_HALF, advice[0]):
+    looped = is_biased_by_feedback(result)  # what explains most may then be the loop
+    if advice and not looped and _explains_more_than(_HALF, advice[0]):
         nearly_all = _explains_more_than(_FIFTH, advice[0])
         result = with_found_change(fitted.fit, result, advice[0].text, nearly_all=nearly_all)
     trials = {"warnings": [*result.warnings, *failed], "advice": advice, "advice_trials": tried}

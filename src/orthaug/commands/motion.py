@@ -21,7 +21,7 @@ from orthaug.fitting.rules import check_motion_choices, check_solver, choose_reg
 from orthaug.inference.measures import Measure, Support
 from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import HOLDS, Motion
-from orthaug.physics.parameters import rate_unit
+from orthaug.physics.parameters import time_unit
 from orthaug.physics.problem import MotionProblem, pose_motion
 from orthaug.reports.result import CheckResult
 
@@ -419,7 +419,8 @@ def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warnin
     """Return a text on the errors of integrator and hold in the outputs, and warnings."""
     motion, warnings = problem.motion, []
     step = problem.record.sampling_time
-    rate = rate_unit(parameter.unit for parameter in motion.parameters)
+    units = [parameter.unit for parameter in motion.parameters]
+    unit = time_unit(units, problem.record.time_column)
     if motion.scheme.discrete:
         return "The equations give the state one sample later: nothing is integrated.", warnings
     if trial.substeps is None:
@@ -429,8 +430,8 @@ def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warnin
         )
         return "", [Warning("physics_runs_away", sentences)]
     sentences = [
-        f"The fastest mode of the initial physics is {problem.fastest:.3g} {rate}, sampled every "
-        f"{step:g} {rate[2:]}; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
+        f"The fastest mode of the initial physics is {problem.fastest:.3g} 1/{unit}, sampled every "
+        f"{step:g} {unit}; {trial.substeps} substep{'s' * (trial.substeps > 1)} of "
         f"{motion.integrator} in a sample"
         + (
             " are as declared."

@@ -223,7 +223,10 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
     for term in test.terms[:_TERMS]:
         words = "a constant" if term.variable is None else ""
         place = term.equation or term.output or term.beside
-        yield from _term(job, term.term, place, term.coefficient, words)
+        note = ""
+        if term.saturates is not None:
+            note = f" (the input {term.variable} saturates at a size of {term.saturates:.3g})"
+        yield from _term(job, term.term, place, term.coefficient, words, note=note)
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -255,6 +258,7 @@ def _term(
     words: str,
     *,
     positive: bool = False,
+    note: str = "",
 ) -> Iterator[Proposal]:
     """Yield the proposal to add a term, with its coefficient as a new parameter.
 
@@ -265,7 +269,7 @@ def _term(
     if made is not None:
         change, where = made
         what = words or f"the term {expression}"
-        yield Proposal(f"{what} {where}", change, positive=name if positive else None)
+        yield Proposal(f"{what} {where}{note}", change, positive=name if positive else None)
 
 
 def _new_name(job: Job, word: str = "size") -> str:

@@ -112,8 +112,7 @@ def rehearse(
         announce: called before the draws with the number of fits and the time they may take.
 
     Raises:
-        InputError: a spec without a learner, rows that are not in memory, terms that cannot be
-            planted.
+        InputError: rows that are not in memory, terms that cannot be planted.
         TrainingError: the fit of the user's data failed.
     """
     with one_blas_thread(), tempfile.TemporaryDirectory(prefix="orthaug-") as own:
@@ -259,6 +258,7 @@ def _result(plan: Plan, asked: Asked, done: Sequence[Run], found: int) -> Recove
         "left_out": [{"name": name, "reason": why} for name, why in plan.left_out],
         "seconds": sum(run.seconds for run in done),
         "stored": found,
+        "physics_only": True if job.spec.declared_learner() is None else None,
         "designs": job.spec.design is not None,
         "warnings": [Warning(w.code, w.text) for w in job.warnings],
     }

@@ -225,6 +225,8 @@ def estimate(
         engine=engine,
         noise=noise,
     )
+    if made.setup is not None:
+        made = replace(made, setup=replace(made.setup, standard_errors=standard_errors))
     if standard_errors == "plain":
         return made
     return MAKERS["intervals"](made, ordered=standard_errors == "auto")

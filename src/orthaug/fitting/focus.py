@@ -27,7 +27,9 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.held_out import (
     Candidate,
     Focus,
+    Folds,
     Pieces,
+    covered_folds,
     held_out_blocks,
     mean_square,
     squared_errors,
@@ -257,7 +259,9 @@ class _FocusChoice:
             for own in ((False, True) if self.learns else (False,))
         ]
         validation = self.options["validation"]
-        records = [(self.problem.record, validation)] if validation is not None else self._folds()
+        records = (
+            [(self.problem.record, validation)] if validation is not None else self.folds.pairs
+        )
         pieces: dict[Key, list[Any]] = {key: [] for key in keys}
         for training, held in records:
             whole = training is self.problem.record
@@ -268,17 +272,18 @@ class _FocusChoice:
                 found += _errors(one, held, self.problem)
         return {key: math.sqrt(mean_square(found)) for key, found in pieces.items()}
 
-    def _folds(self) -> list[tuple[Record, Record]]:
-        """Return pairs of training rows and held-out blocks.
+    @cached_property
+    def folds(self) -> Folds:
+        """Folds of training rows and held-out blocks.
 
         Of few rows the training data themselves.
         """
+        record, first = self.problem.record, self.problem.first_row
+        blocks = self.options["blocks"] or BLOCKS
         try:
-            return held_out_blocks(
-                self.problem.record, self.options["blocks"] or BLOCKS, self.problem.first_row
-            )
+            return covered_folds(record, blocks, first, self.first.model)
         except InputError:
-            return [(self.problem.record, self.problem.record)]
+            return Folds(((record, record),))
 
     def _quick_fit(self, training: Record, criterion: Criterion) -> Any:
         solver = fold_solver(
@@ -322,6 +327,8 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Estimate:
         "runs on held-out rows, in standard deviations of the output: "
         f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
+    if choosing.options["validation"] is None and choosing.folds.note:
+        text += f" {choosing.folds.note}"
     warnings = list(best.warnings)
     if key[0] == FREE_RUN and any(warning.code == NOT_CONVERGED for warning in warnings):
         warnings = [w for w in warnings if w.code != NOT_CONVERGED]

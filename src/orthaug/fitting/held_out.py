@@ -10,22 +10,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from scipy import special
 
-from orthaug._base.checks import Vector
+from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
+from orthaug._base.lines import percent
 from orthaug.data.record import Experiment, Record
+from orthaug.models.model import Model
 from orthaug.models.response import Response
 
 WORTH = 0.02  # of the error: less than this is neither help nor harm
 _FEWEST = 20  # usable rows of a block
+# Of the rows of held-out blocks: more outside the range of the others compares extrapolations
+_OUTSIDE = 0.25
+_BARELY = 0.01  # of the range: less is not outside
+_SPREAD, _FEWEST_SPREAD = 4, 40  # stretches of a block that is spread at most; rows of one at least
 # Pieces of a free run that the bootstrap draws from: longer than its errors remember
 _STRETCHES = 20
 _DRAWS = 999
 
+_Rows = tuple[int, int, int]  # an experiment, its rows from, and to
 Pieces = Sequence[Vector | None]
 """Squared errors along each held-out run, mean over the outputs; None for a run that diverged."""
 
@@ -164,6 +173,8 @@ class HeldOutErrors:
     alone: Pieces = field(repr=False)  # an error for every row: thousands of lines on a screen
     runs: tuple[Pieces, ...] = field(repr=False)
     chosen: int = 0
+    note: str = ""
+    """A sentence on blocks that leave the range of the other rows; "" where none do."""
 
     @property
     def ratio(self) -> Ratio:
@@ -207,10 +218,159 @@ def squared_errors(
     return pieces
 
 
-def held_out_blocks(record: Record, blocks: int, start: int) -> list[tuple[Record, Record]]:
-    """Return (training, held out) for each of `blocks` contiguous blocks of similar length.
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """Folds of blocked cross-validation: (training, held out) of each.
 
-    `start` rows around a block are left out.
+    A block is one stretch of rows. Where whole blocks leave the range of the learner's features
+    over the other rows, which compares extrapolations, it is several stretches spread over the
+    record, less those that leave that range still.
+    """
+
+    pairs: tuple[tuple[Record, Record], ...]
+    stretches: int = 1
+    feature: str = ""
+    """The learner's input that whole blocks leave the range of; "" for none."""
+    share: float = 0.0
+    """Of the rows of whole blocks that lie outside it."""
+
+    @property
+    def where(self) -> str:
+        """The name of the comparison."""
+        return f"blocked cross-validation ({len(self.pairs)} blocks)"
+
+    @property
+    def note(self) -> str:
+        """A sentence on blocks that leave the range of the other rows; "" where none do."""
+        if not self.feature:
+            return ""
+        outside = f"in {self.feature}, on {percent(self.share)} of their rows"
+        if self.stretches > 1:
+            return (
+                f"Whole blocks would leave the range of the other rows ({outside}). So each block "
+                f"is {self.stretches} stretches spread over the record, and those outside that "
+                "range do not count."
+            )
+        return (
+            f"The blocks leave the range of the other rows ({outside}), so this compares "
+            "extrapolations. A validation part within the range of the training data would judge "
+            "the learner there."
+        )
+
+
+def covered_folds(
+    record: Record, blocks: int, start: int, model: Model[Any] | None = None
+) -> Folds:
+    """Return folds whose held-out rows lie in the range of the others, as far as the rows allow.
+
+    Args:
+        record: to cut.
+        blocks: number of folds.
+        start: rows at the beginning of an experiment without a prediction.
+        model: of the whole record, whose free run has what the learner sees; None for unknown.
+
+    Raises:
+        InputError: too few rows for so many blocks.
+    """
+    whole = Folds(tuple(held_out_blocks(record, blocks, start)))
+    features = None if model is None else _features(model, record)
+    if model is None or features is None:
+        return whole
+    names = [entry.text for entry in model.form.entries]
+    lengths = [len(experiment) for experiment in record.experiments]
+
+    def outside(stretches: int) -> list[list[Bool[np.ndarray, "n nz"]]]:
+        rows = block_rows(lengths, blocks, start, stretches)
+        return [_outside(features, kept, held) for kept, held in rows]
+
+    shares = np.concatenate([piece for fold in outside(1) for piece in fold]).mean(axis=0)
+    if not shares.max() > _OUTSIDE:
+        return whole
+    found = {"feature": names[int(shares.argmax())], "share": float(shares.max())}
+    stretches = min(_SPREAD, len(record) // (blocks * _FEWEST_SPREAD))
+    if stretches > 1:
+        covered = [
+            [piece.any(axis=1).mean() < 0.5 for piece in fold] for fold in outside(stretches)
+        ]
+        if all(map(any, covered)):
+            pairs = tuple(
+                (training, replace(held, experiments=tuple(compress(held.experiments, inside))))
+                for (training, held), inside in zip(
+                    held_out_blocks(record, blocks, start, stretches), covered, strict=True
+                )
+            )
+            return Folds(pairs, stretches, **found)
+    return replace(whole, **found)
+
+
+def _features(model: Model[Any], record: Record) -> list[Matrix] | None:
+    """Return what the learner sees (N, nz) along the free run of each experiment.
+
+    None where it sees nothing, or the run leaves all bounds. Rows before the run's first are NaN.
+    """
+    if not (model.learns and model.form.has_range and model.form.entries):
+        return None
+    found = []
+    for experiment in record.experiments:
+        seen = model.features_along(*model.free_run(experiment, record))
+        if not np.isfinite(seen).all() or seen.shape[1] != len(model.form.entries):
+            return None
+        before = len(experiment) - len(seen)
+        found.append(np.concatenate([np.full((before, seen.shape[1]), np.nan), seen]))
+    return found
+
+
+def _outside(
+    features: Sequence[Matrix], kept: Sequence[_Rows], held: Sequence[_Rows]
+) -> list[Bool[np.ndarray, "n nz"]]:
+    """Return where held-out rows leave the range of the features over the kept ones."""
+    training = np.concatenate([features[i][a:b] for i, a, b in kept])
+    low, high = np.nanmin(training, axis=0), np.nanmax(training, axis=0)
+    slack = _BARELY * (high - low)
+    with np.errstate(invalid="ignore"):
+        return [
+            (features[i][a:b] < low - slack) | (features[i][a:b] > high + slack) for i, a, b in held
+        ]
+
+
+def block_rows(
+    lengths: Sequence[int], blocks: int, start: int, stretches: int = 1
+) -> list[tuple[list[_Rows], list[_Rows]]]:
+    """Return the rows (training, held out) of each block, as (experiment, from, to).
+
+    Args:
+        lengths: rows of each experiment.
+        blocks: of similar length.
+        start: rows around a stretch that are left out; an experiment needs more.
+        stretches: that make a block, spread over the record.
+    """
+    edges = np.linspace(0, sum(lengths), blocks * stretches + 1).round().astype(int)
+    found = []
+    for block in range(blocks):
+        held, kept, offset = [], [], 0
+        for i, rows in enumerate(lengths):
+            last = 0
+            for low, high in zip(edges[block:-1:blocks], edges[block + 1 :: blocks], strict=True):
+                a, b = (int(np.clip(edge - offset, 0, rows)) for edge in (low, high))
+                if a < b:
+                    held.append((i, a, b))
+                    kept.append((i, last, a - start))
+                    last = b + start
+            kept.append((i, last, rows))
+            offset += rows
+        found.append(
+            tuple([(i, a, b) for i, a, b in rows if b - a > start] for rows in (kept, held))
+        )
+    return found
+
+
+def held_out_blocks(
+    record: Record, blocks: int, start: int, stretches: int = 1
+) -> list[tuple[Record, Record]]:
+    """Return (training, held out) for each of `blocks` blocks of similar length.
+
+    A block is contiguous, or so many stretches spread over the record. `start` rows around them
+    are left out.
 
     All training records have the same number of usable rows after the first `start` of each
     experiment.
@@ -218,20 +378,10 @@ def held_out_blocks(record: Record, blocks: int, start: int) -> list[tuple[Recor
     Raises:
         InputError: too few rows for so many blocks.
     """
-    edges = np.linspace(0, len(record), blocks + 1).round().astype(int)
     folds = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        held, kept, offset = [], [], 0
-        for experiment in record.experiments:
-            rows = len(experiment)
-            a, b = (int(np.clip(edge - offset, 0, rows)) for edge in (low, high))
-            inside = a < b
-            held += [experiment.rows(a, b)] if inside else []
-            before, after = (a - start, b + start) if inside else (rows, rows)
-            kept += [experiment.rows(0, before)] if before > start else []
-            kept += [experiment.rows(after, rows)] if rows - after > start else []
-            offset += rows
-        held = [e for e in held if len(e) > start]
+    lengths = [len(experiment) for experiment in record.experiments]
+    for rows in block_rows(lengths, blocks, start, stretches):
+        kept, held = ([record.experiments[i].rows(a, b) for i, a, b in pieces] for pieces in rows)
         if (
             sum(len(e) - start for e in held) < _FEWEST
             or sum(len(e) - start for e in kept) < _FEWEST

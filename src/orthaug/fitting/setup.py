@@ -24,6 +24,8 @@ class TrainingSetup:
     train: Callable[..., Any]
     problem: Any
     options: Mapping[str, Any]
+    standard_errors: str = "auto"
+    """Those that were asked for: as for `estimate`."""
 
     @classmethod
     def of(

@@ -21,7 +21,7 @@ from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.held_out import (
     HeldOutErrors,
     Pieces,
-    held_out_blocks,
+    covered_folds,
     mean_square,
     squared_errors,
 )
@@ -33,6 +33,7 @@ from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
+from orthaug.models.model import Model
 from orthaug.models.rows import Engine
 
 # of the effective weights in cross-validation, against following the noise (Kim and Gu 2004)
@@ -375,26 +376,35 @@ def _held_out(
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
-        folds = held_out_blocks(task.problem.record, choice.blocks, task.problem.first_row)
+        model = _lowest(task, runs, concluded)
+        folds = covered_folds(task.problem.record, choice.blocks, task.problem.first_row, model)
     except InputError:  # too few rows to leave some out
         LOG.debug(
             "too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks
         )
         return None
-    LOG.info("cross-validation: %d folds of %d runs", len(folds), len(starts))
+    LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(starts))
     ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
     taken = max(run.iterations for run in runs)
     given = (task, list(zip(starts, ridges, strict=True)), structure, solver, taken)
-    found = runner.map(_on_fold, given, folds)
+    found = runner.map(_on_fold, given, folds.pairs)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
     labels = tuple(
         f"block {i + 1} of {choice.blocks}"
-        for i, (_, held) in enumerate(folds)
+        for i, (_, held) in enumerate(folds.pairs)
         for _ in held.experiments
     )
-    return HeldOutErrors(
-        f"blocked cross-validation ({choice.blocks} blocks)", labels, pieces[0], tuple(pieces[1:])
-    )
+    return HeldOutErrors(folds.where, labels, pieces[0], tuple(pieces[1:]), note=folds.note)
+
+
+def _lowest(
+    task: Task, runs: Sequence[FinishedRun], concluded: Callable[[int], Estimate]
+) -> Model[Any] | None:
+    """Return the model of the run of the lowest loss; None where none has ended well."""
+    losses = [task.loss(run) if run.ending.usable else math.inf for run in runs]
+    best = int(np.argmin(losses))
+    fit = concluded(best) if math.isfinite(losses[best]) else None
+    return fit.model if fit is not None and fit.status.ok else None
 
 
 def _on_fold(given: Any, fold: tuple[Record, Record], report: Callable[..., None]) -> list[Pieces]:
@@ -446,7 +456,7 @@ def _fell_back(held_out: HeldOutErrors) -> Warning:
         f"in {held_out.where} the learner is not better than physics alone ({errors}). The "
         "result is physics alone; `fallback = false` keeps the learner."
     )
-    return Warning("physics_alone", text)
+    return Warning("physics_alone", f"{text} {held_out.note}".strip())
 
 
 def _conclude_physics(task: Task, structure: Structure, *, briefly: bool = False) -> Estimate:

@@ -259,12 +259,16 @@ class Model(RecordModel[Form], NotebookView):
             found = _with_physics(found, np.where(lost, np.nan, physics))
         if not self.form.has_range:
             return found
-        with np.errstate(all="ignore"):
-            read = self.form.at_samples(self.numbers, run.states, inputs)
-            outside = self.beyond(self.form.features_at(run.states, read))
+        outside = self.beyond(self.features_along(run, inputs))
         return replace(
             found, outside=np.concatenate([np.zeros(self.form.first_row, dtype=bool), outside])
         )
+
+    def features_along(self, run: Run, inputs: Matrix) -> Matrix:
+        """Return the learner's features (T, nz) along a free run and its inputs (T, nu)."""
+        with np.errstate(all="ignore"):
+            read = self.form.at_samples(self.numbers, run.states, inputs)
+            return self.form.features_at(run.states, read)
 
     def states(self, record: Record, initial: str | Any = "measured") -> pd.DataFrame:
         """Return the states of a free run.

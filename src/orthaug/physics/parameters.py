@@ -20,10 +20,15 @@ from jaxtyping import Bool
 from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
 from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
+from orthaug.data.headers import split_header, unit_of_time
 from orthaug.physics.baseline import Baseline, Parameter, check_bounds
 from orthaug.physics.excitation import Excitation, excitation
 
 _RATE = re.compile(r"1/(ms|s|min|h|hr|hour|d|day|week|month|yr|year)")
+# Times other than s in a unit, and factors by which an equation converts them
+_OTHER_TIME = re.compile(r"(?<![A-Za-z])(min|h|hr|hour|d|day|week)(?![A-Za-z])")
+_CONVERTS = re.compile(r"(?<![\w.])(60|1440|3600|86400|1000|1e3|0\.001|1e-3)(\.0*)?(?![\w.])")
+_FACTORS = {60.0, 1440.0, 3600.0, 86400.0, 1000.0, 0.001, 1 / 60, 1 / 3600, 1 / 86400}
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
 
 _SMALLEST = math.exp(-30.0)  # of p⁰: a positive parameter that is smaller is zero
@@ -52,17 +57,75 @@ _COMPLEX = SimpleNamespace(
 )
 
 
-def rate_unit(units: Iterable[str]) -> str:
-    """Return the unit of rates that parameters of these units imply: that of all that are rates.
+def time_unit(units: Iterable[str], column: str | None = None) -> str:
+    """Return the unit of time of equations whose parameters have these units.
 
     Equations are in the time of the record, so that rates in 1/day mean that its steps are days.
+    It is s where rates differ, and where the instants of a `column` were read in seconds.
 
     Examples:
-        >>> rate_unit(["1/day", "", "1/day"]), rate_unit(["kg", "N/m"]), rate_unit(["1/h", "1/s"])
-        ('1/day', '1/s', '1/s')
+        >>> time_unit(["1/day", "", "1/day"]), time_unit(["kg", "N/m"]), time_unit(["1/h", "1/s"])
+        ('day', 's', 's')
+        >>> time_unit(["1/min"], column="t [min]")
+        's'
     """
+    if _is_in_seconds(column):
+        return "s"
     found = {unit.replace(" ", "") for unit in units if _RATE.fullmatch(unit.replace(" ", ""))}
-    return found.pop() if len(found) == 1 else "1/s"
+    return found.pop()[2:] if len(found) == 1 else "s"
+
+
+def _is_in_seconds(column: str | None) -> bool:
+    """Return whether the instants of a column were surely read in seconds: it names their unit."""
+    if column is None:
+        return False
+    unit = unit_of_time(column)[1]
+    return unit is not None and (unit != 1.0 or bool(split_header(column)[1]))
+
+
+def check_time_units(motion: Any, column: str | None) -> tuple[str, ...]:
+    """Check that rates and times in equations of motion are in s where instants surely are.
+
+    A column of instants whose header has a unit is read in seconds, and derivatives are per second.
+    Equations with a factor that converts, such as 60, are left to the user.
+
+    Args:
+        motion: its states and parameters.
+        column: of the instants; None where a sampling time was given, whose unit only the user
+            knows.
+
+    Returns:
+        The parameters in these equations whose units have another time among others, such as
+        K/min.
+
+    Raises:
+        InputError: a parameter in 1/min, or in min.
+    """
+    if not _is_in_seconds(column) or motion.scheme.discrete:
+        return ()
+    if motion.functions is not None or motion.source is not None:
+        return ()
+    texts = [*(e.text for e in motion.equations.values()), *(e.text for _, e in motion.definitions)]
+    if any(_CONVERTS.search(text) for text in texts):
+        return ()
+    if any(float(value) in _FACTORS for _, value in motion.constants):
+        return ()
+    found = []
+    read = {name for state in motion.equations for name in motion.parameters_in(state)}
+    for one in (one for one in motion.parameters if one.name in read):
+        unit = one.unit.replace(" ", "")
+        rate = unit.startswith("1/")
+        factor = unit_of_time(f"x [{unit[2 * rate :]}]")[1] if unit else None
+        if factor is None and _OTHER_TIME.search(unit):
+            found.append(one.name)
+        elif factor is not None and factor != 1.0:
+            value = one.initial / factor if rate else one.initial * factor
+            raise InputError(
+                f"parameter '{one.name}' has the unit {one.unit}, but equations are per second: "
+                f"the instants of column '{column}' are read in seconds. Give its initial value "
+                f"({value:.4g}), bounds and unit in {'1/' * rate}s, or convert it in the equation."
+            )
+    return tuple(found)
 
 
 @dataclass(frozen=True)

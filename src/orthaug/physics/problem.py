@@ -36,7 +36,7 @@ from orthaug.physics.moments import Extent, Moments
 from orthaug.physics.motion import Motion
 from orthaug.physics.noise import RowFilter
 from orthaug.physics.output_weights import OutputWeights, check_output_weights, weigh_outputs
-from orthaug.physics.parameters import PhysicalParameter
+from orthaug.physics.parameters import PhysicalParameter, check_time_units
 from orthaug.physics.projection import Projection
 from orthaug.physics.row_checks import check_moving, check_physics, check_sizes, feature_rows
 from orthaug.physics.shared import SharedDirections, shared_directions
@@ -571,6 +571,7 @@ def pose_motion(
     inputs, outputs = (tuple(c.name for c in group) for group in (record.inputs, record.outputs))
     motion = motion.sampled(record.sampling_time)
     motion.check_channels(inputs, outputs)
+    check_time_units(motion, record.time_column)
     if not record.even:
         motion.check_paced(record)
     motion, learner_inputs = add_memory(motion, learner_inputs, memory, record)

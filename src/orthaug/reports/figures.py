@@ -412,7 +412,7 @@ class FitPlots:
         unit = gain_unit(view, i, j)
         what = "phase [°]" if phase else with_unit("gain", unit)
         axis.set(
-            xlabel="frequency [Hz]",
+            xlabel=f"frequency [{view.frequency_unit}]",
             ylabel=what,
             title=f"from {view.inputs[j]} to {view.outputs[i]}",
         )

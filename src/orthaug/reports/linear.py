@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -102,6 +102,8 @@ class MatricesResult(Content):
 class LinearPointResult(Content):
     """The linear system at a point of rest."""
 
+    absent: ClassVar = frozenset({"time_unit"})
+
     at: ByName
     outputs: ByName
     outside: Flag
@@ -110,6 +112,8 @@ class LinearPointResult(Content):
     matrices: MatricesResult
     poles: list[PoleResult]
     poles_at_zero: Whole
+    time_unit: str | None = None
+    """The unit of time, where the equations are not in s."""
     static_gain: list[GainResult]
     continuous: ContinuousResult
     frequency: Numbers
@@ -188,6 +192,7 @@ def _point(view: LinearView, found: Linearization) -> dict[str, object]:
         "matrices": _matrices(view),
         "poles": [PoleResult.of(pole) for pole in view.poles],
         "poles_at_zero": view.at_zero,
+        "time_unit": None if view.time_unit == "s" else view.time_unit,
         "static_gain": [_gain(view, i, j) for i, j in np.ndindex(*view.d.shape)],
         "continuous": _continuous(view),
         "frequency": [] if view.bode is None else view.bode.frequency,

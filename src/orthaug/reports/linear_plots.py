@@ -52,7 +52,9 @@ def bode_figure(found: Linearization) -> Figure:
         unit = gain_unit(first, i, j)
         _draw_pair(found, views, upper, lower, (i, j))
         label(upper, y=with_unit("gain", unit))
-        label(lower, y="phase [°]", x="frequency [Hz]" if i == ny - 1 else None)
+        label(
+            lower, y="phase [°]", x=f"frequency [{first.frequency_unit}]" if i == ny - 1 else None
+        )
         if ny * nu > 1:
             upper.set_title(
                 f"{first.outputs[i]} / {first.inputs[j]}", fontsize=9, loc="left", y=1.0

@@ -91,13 +91,15 @@ def _poles(view: LinearView) -> list[str]:
         magnitude = _with_interval(pole.magnitude, pole.magnitude_ci95)
         hertz, spread = _with_interval(pole.hertz, pole.hertz_ci95)
         damping, damping_spread = _with_interval(pole.damping, pole.damping_ci95)
-        rate = "–" if pole.natural_frequency is None else f"{pole.natural_frequency:.5g} 1/s"
+        rate = "–"
+        if pole.natural_frequency is not None:
+            rate = f"{pole.natural_frequency:.5g} 1/{view.time_unit}"
         last = (
             damping_spread
             if pole.time_constant is None
-            else f"time constant {pole.time_constant:.5g} s"
+            else f"time constant {pole.time_constant:.5g} {view.time_unit}"
         )
-        unit = "" if pole.hertz is None else " Hz"
+        unit = "" if pole.hertz is None else f" {view.frequency_unit}"
         rows.append([_z(pole), *magnitude, f"{hertz}{unit}", spread, rate, damping, last])
     lines = table(rows) if len(rows) > 1 else []
     if view.at_zero:
@@ -127,7 +129,9 @@ def _matrices(view: LinearView) -> list[list[str]]:
             for j in range(n + nu)
         ]
         rows.append([label, *cells])
-    return [[f"Ts = {view.sampling_time:.6g} s; rows of [A B] and [C D]:", *table(rows)]]
+    return [
+        [f"Ts = {view.sampling_time:.6g} {view.time_unit}; rows of [A B] and [C D]:", *table(rows)]
+    ]
 
 
 def _cell(value: float, half: float | None) -> str:
@@ -156,7 +160,7 @@ def _continuous(view: LinearView) -> list[str]:
         rows.append([label, *(f"{value:.6g}" for value in found.system.matrix[i])])
     lines += table(rows)
     late = [
-        f"{name} {dead:.6g} s"
+        f"{name} {dead:.6g} {view.time_unit}"
         for name, dead in zip(view.inputs, found.dead_time, strict=True)
         if dead > 0
     ]

@@ -7,7 +7,7 @@ from typing import Any
 
 from orthaug._base.lines import with_unit
 from orthaug.analysis.residual_tests import ResidualTestResult
-from orthaug.physics.parameters import rate_unit
+from orthaug.physics.parameters import time_unit
 from orthaug.reports.biases import REMOVED_BY
 from orthaug.reports.page_blocks import Grid, Table, Text, chance, number, percent
 from orthaug.reports.page_figures import bias_plot, residual_plots, restart_plot
@@ -87,7 +87,7 @@ def stability_blocks(result: FitResult) -> list[Any]:
     if found.contraction:
         rows.append(["rate of the best norm", number(found.contraction.rate, 4)])
     if found.modes:
-        m, rate = found.modes, rate_unit(one.unit for one in result.parameters)
+        m, rate = found.modes, f"1/{time_unit(one.unit for one in result.parameters)}"
         slow, fast = number(m.slowest, 3), number(m.fastest, 3)
         modes = (
             [f"modes [{rate}]", f"all at {slow}"]

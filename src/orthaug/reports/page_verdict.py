@@ -26,6 +26,7 @@ _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error i
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _UNSTABLE = "unstable_plant"
 _RAN_AWAY = "free_run_diverged"
+_COLOURED = "coloured_residual"  # of the free run of a fit that takes it for white
 # Of models that are as good as each other these are taken first
 _TIED = ("orthogonal", "physics alone")
 
@@ -273,7 +274,7 @@ def _has_warning(result: FitResult | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
-def _is_biased_by_feedback(result: FitResult | RowResult) -> bool:
+def is_biased_by_feedback(result: FitResult | RowResult) -> bool:
     """Return whether feedback is in the data, and no noise model that leaves white errors."""
     white = result.residuals is not None and result.residuals.verdict == "white"
     return _has_warning(result, "closed_loop") and not (_has_noise_model(result) and white)
@@ -324,9 +325,15 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             else "its residual contains more than noise",
             "sensor_noise": "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
+    error, _ = _worst_score(result.scores)
+    if error is not None and error > _GOOD:
+        if result.residuals is None:
+            yield "its residual could not be tested"
+        elif result.residuals.verdict == "equation_noise" and _has_warning(result, _COLOURED):
+            yield "its errors are large and correlated with their past"
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
-    if _is_biased_by_feedback(result):
+    if is_biased_by_feedback(result):
         yield "its data were probably recorded under feedback, " + (
             "where a noise model needs complete physics and enough orders"
             if _has_noise_model(result)
@@ -386,6 +393,7 @@ _UNTESTED = {
     "poor_start": "its training probably ended in a local minimum",
     "several_solutions": "other values of its parameters explain its data as well",
     "parameter_drift": "a parameter changes over its record",
+    "parameter_depends": "a parameter depends on a signal",
     "parameter_by_experiment": "its parameters differ between the experiments",
     "differs_between_experiments": "its parameters differ between the experiments",
     "reset_output": "an output goes on elsewhere within its record",
@@ -493,6 +501,11 @@ def _option(result: FitResult) -> str | None:
         return (
             'physics alone (`learner.kind = "none"`), or a learner of other inputs or fewer neurons'
         )
+    if is_biased_by_feedback(result):
+        return (
+            "data with the reference recorded and the loop simulated (`controller`), with larger "
+            "motions of the reference, or without the controller"
+        )
     predicted = None if result.advice_trials is not None else _predicted_change(result)
     if predicted is not None:
         return predicted
@@ -510,11 +523,6 @@ def _option(result: FitResult) -> str | None:
         )
     if _has_warning(result, _RAN_AWAY):
         return "data over the range that the free run leaves"
-    if _is_biased_by_feedback(result):
-        return (
-            "data with the reference recorded and the loop simulated (`controller`), with larger "
-            "motions of the reference, or without the controller"
-        )
     if _is_undecided(result):
         return (
             "the learner (`training.fallback = false`), because cross-validation does not "

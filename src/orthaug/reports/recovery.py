@@ -143,7 +143,7 @@ class DrawResult(Content):
 class RecoverResult(ResultHeader):
     """The result of `orthaug recover`."""
 
-    absent: ClassVar = frozenset()
+    absent: ClassVar = frozenset({"physics_only"})
 
     spec: dict[str, Any]
     data: DataResult
@@ -158,6 +158,8 @@ class RecoverResult(ResultHeader):
     left_out: list[LeftOutResult]
     choices: list[ChoiceResult]
     outcomes: list[DrawResult]
+    physics_only: Flag | None = None
+    """True if the spec has no learner, as large as which terms would be."""
     designs: Flag
     """True if the spec has a [design], whose input is among the choices."""
     seconds: Number
@@ -428,7 +430,11 @@ def recover_text(result: RecoverResult) -> str:
     """Return the tables and what follows from them."""
     noise = ", ".join(f"{name} {_number(value)}" for name, value in result.noise.std.items())
     place = "the equation" if result.noise.enters == "equation" else "the outputs"
-    size = "as large as the learner" if result.share is None else f"{result.share:g} of the physics"
+    size = "as large as the learner"
+    if result.physics_only:
+        size = "as large as the noise, or 2 % of the physics"
+    if result.share is not None:
+        size = f"{result.share:g} of the physics"
     lines = [
         f"rehearsal   {plural(result.draws, 'draw')} of {plural(result.rows, 'row')}, seed "
         f"{result.seed}" + (f", {result.stored} read from the folder" if result.stored else ""),

@@ -115,7 +115,8 @@ def size_of(columns: Columns, share: float | None = None) -> float | None:
 
     Beside the physics, so `rms(P⊥F)/rms(P⊥Δ)`, with the sign of their product: this is what the
     data show, while the part within the physics' span is what no one sees. At most half of the
-    physics in the same equation.
+    physics in the same equation. Without a learner as large as the noise in the equation, or 2 % of
+    the physics.
 
     Args:
         share: RMS of the whole term over that of the physics in its equation, instead.
