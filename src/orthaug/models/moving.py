@@ -53,21 +53,25 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Array, row: Array)
     row, pace = form.split_pace(row)
     at, halves = input_at(row, len(form.motion.inputs)), 2 * form.substeps
     h, identity = pace * form.sampling_time / form.substeps, jnp.eye(form.states)
-    through, x = [], state
-    for j in range(form.substeps):
-        u = [at(2 * j + i, halves) for i in range(3)]
-        first = field_slopes(form, numbers, x, u[0])
-        second = field_slopes(form, numbers, x + h / 2 * first.value, u[1])
-        third = field_slopes(form, numbers, x + h / 2 * second.value, u[1])
-        fourth = field_slopes(form, numbers, x + h * third.value, u[2])
+    inputs = [[at(2 * j + i, halves) for i in (0, 1, 1, 2)] for j in range(form.substeps)]
+
+    def substep(x: Array, u: Any) -> tuple[Array, list[tuple[Array, Slopes]]]:
+        first, second, third, fourth = stages = _stage_slopes(form, numbers, x, u, h)
         x = x + h / 6 * (first.value + 2 * (second.value + third.value) + fourth.value)
         psi4 = h / 6 * identity
         psi3 = h / 3 * identity + h * psi4 @ fourth.to_x
         psi2 = h / 3 * identity + h / 2 * psi3 @ third.to_x
         psi1 = h / 6 * identity + h / 2 * psi2 @ second.to_x
-        through.append(
-            list(zip((psi1, psi2, psi3, psi4), (first, second, third, fourth), strict=True))
-        )
+        return x, list(zip((psi1, psi2, psi3, psi4), stages, strict=True))
+
+    through, x = [], state
+    if form.large and form.substeps > 1:
+        x, every = jax.lax.scan(substep, x, jnp.array(inputs))
+        through = [jax.tree.map(lambda part, j=j: part[j], every) for j in range(form.substeps)]
+    else:
+        for u in inputs:
+            x, stages = substep(x, u)
+            through.append(stages)
     to_x, to_c, to_w = identity, 0.0, jnp.zeros((form.states, form.bound.size))
     learned = np.array(form.corrected[0], dtype=int)
     for stages in reversed(through):  # `to_x` is what follows this substep
@@ -76,6 +80,29 @@ def sample_slopes(form: MotionField, numbers: Numbers, state: Array, row: Array)
             to_w = to_w + sum((to_x @ psi)[:, learned] @ stage.to_w for psi, stage in stages)
         to_x = to_x @ (identity + sum(psi @ stage.to_x for psi, stage in stages))
     return Slopes(x, to_x, to_c, to_w)
+
+
+def _stage_slopes(form: MotionField, numbers: Numbers, x: Array, u: Any, h: Any) -> list[Slopes]:
+    """Return F and its slopes at the four stages of a substep, with their inputs.
+
+    A large F is written once into a program.
+    """
+    shares = (0.0, h / 2, h / 2, h)
+    if form.large:
+
+        def stage(before: Array, given: tuple[Array, Array]) -> tuple[Array, Slopes]:
+            share, inputs = given
+            found = field_slopes(form, numbers, x + share * before, inputs)
+            return found.value, found
+
+        given = (jnp.stack([jnp.asarray(share, dtype=float) for share in shares]), jnp.stack(u))
+        every = jax.lax.scan(stage, jnp.zeros_like(x), given)[1]
+        return [jax.tree.map(lambda part, i=i: part[i], every) for i in range(4)]
+    found: list[Slopes] = []
+    for share, inputs in zip(shares, u, strict=True):
+        moved = x + share * found[-1].value if found else x
+        found.append(field_slopes(form, numbers, moved, inputs))
+    return found
 
 
 @partial(jax.jit, static_argnames="form")  # for the stages of all substeps it is traced once
@@ -175,8 +202,6 @@ def _finite(slope: Array) -> Array:
 
 
 _FEWER = 128  # rows per compiled call, where each calls the host
-_LARGE = 150
-# operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)
@@ -301,7 +326,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             return sum(self.rates(numbers, state, now))
         exponentials = self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0]
         inputs, pace = self.split_pace(inputs)
-        h, large = pace * self.sampling_time / self.substeps, self._large
+        h, large = pace * self.sampling_time / self.substeps, self.large
         field = partial(_field, self, numbers)
         step = self.motion.scheme.step(field, h, exponentials, looped=large)
         held, external = len(self.motion.held), len(self.motion.external)
@@ -335,12 +360,8 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
     @property
-    def _large(self) -> bool:
-        return self.motion.size > _LARGE
-
-    @property
     def _by_stages(self) -> bool:
-        few = self.substeps <= UNROLLED and not self._large and not self.motion.held
+        few = self.substeps <= UNROLLED and not self.motion.held
         return self.motion.scheme.has_adjoint and few and self.differentiable
 
     def tangents(
