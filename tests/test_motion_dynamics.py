@@ -137,12 +137,14 @@ def test_inputs_between_samples() -> None:
     np.testing.assert_allclose(spline[:-1, -1], u[1:], atol=1e-12)
 
 
+@pytest.mark.parametrize("large", [False, True])
 @pytest.mark.parametrize(
     ("integrator", "substeps", "hold"), [("rk4", 1, "zero-order"), ("rk4", 2, "spline")]
 )
 def test_the_adjoint_of_the_stages_gives_the_derivatives(
-    integrator: str, substeps: int, hold: str
+    integrator: str, substeps: int, hold: str, large: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("orthaug.models.motion_field._LARGE", 0 if large else 1000)
     form, made = with_learner(spring(integrator=integrator, hold=hold, learned=True), substeps)
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "spline": 2 * substeps + 1}[hold]
