@@ -163,9 +163,11 @@ def test_inputs_between_samples() -> None:
         (2, "zero-order", Cubic()),
     ],
 )
+@pytest.mark.parametrize("large", [False, True])
 def test_the_adjoint_of_the_stages_gives_the_derivatives(
-    substeps: int, hold: str, learner: oa.Learner
+    substeps: int, hold: str, learner: oa.Learner, large: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("orthaug.models.motion_field._LARGE", 0 if large else 1000)
     form, made = with_learner(spring(integrator="rk4", hold=hold, learned=True), substeps, learner)
     rng = np.random.default_rng(3)
     points = {"zero-order": 1, "first-order": 2, "spline": 2 * substeps + 1}[hold]

@@ -22,12 +22,14 @@ import orthaug as oa
 from orthaug import FMU, InputError, Motion, Output, PhysicalParameter, Record, State
 from orthaug._base import plugins
 from orthaug.physics import consent
+from orthaug.physics.fmu import Evaluation
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
 NAMES = ("m", "c", "k")
+MOST_POINTS = 100_000  # 314,916 where windows are padded to 1024 rows, and 71,076 where not
 
 
 def equations(learned: bool = False) -> Motion:
@@ -114,6 +116,18 @@ def test_a_fit_is_that_of_the_same_equations(folder: Path) -> None:
     theirs = oa.estimate(record(), equations(), learner=None)
     np.testing.assert_allclose(mine.values, theirs.values, rtol=1e-9)
     np.testing.assert_allclose(mine.parameters["std"], theirs.parameters["std"], rtol=1e-5)
+
+
+def test_a_fit_asks_the_fmu_for_few_points(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, values = [], Evaluation.values
+
+    def counted(self: Evaluation, z: Any) -> Any:
+        asked.append(len(z))
+        return values(self, z)
+
+    monkeypatch.setattr(Evaluation, "values", counted)
+    oa.estimate(record(rows=60), spring(folder), learner=None, blocks=0)
+    assert sum(asked) < MOST_POINTS
 
 
 @pytest.mark.proof

@@ -36,6 +36,7 @@ from orthaug._base.jax import Array, jax, jnp
 _TARGET = "orthaug_host_call"
 _METADATA = 1  # the extension by which XLA asks for the version of a handler
 _INTERNAL = 13  # XLA's code of an error
+_WORTH_COMPARING = 8  # rows: to find repeated ones among fewer takes longer than to compute them
 _FUNCTIONS: list[HostFunction] = []
 
 
@@ -87,7 +88,7 @@ def _at_different_rows(function: HostFunction, rows: Matrix) -> tuple[np.ndarray
 
     Compiled programs pad theirs so.
     """
-    if len(rows) < 2:
+    if len(rows) < _WORTH_COMPARING:
         return function(rows)
     fresh = np.ones(len(rows), dtype=bool)
     fresh[1:] = (rows[1:] != rows[:-1]).any(axis=1)

@@ -24,6 +24,8 @@ from orthaug.models.learners import Bound
 from orthaug.physics.integrators import split_pace
 from orthaug.physics.motion import Motion
 
+_LARGE = 150  # operations in the expressions of a motion
+
 
 @dataclass(frozen=True)
 class MotionField:
@@ -42,6 +44,11 @@ class MotionField:
     @property
     def states(self) -> int:
         return len(self.motion.states)
+
+    @property
+    def large(self) -> bool:
+        """True if its stages are compiled in a loop; one by one they take a minute."""
+        return self.motion.size > _LARGE
 
     @property
     def learns(self) -> bool:

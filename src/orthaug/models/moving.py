@@ -79,9 +79,12 @@ def sample_slopes(
 
     points, pace = jax.vmap(at_points, -1, -1)(rows)
     h = pace * form.sampling_time / form.substeps
-    over_substeps = _unrolled if form.substeps <= (2 if learned else UNROLLED) else jax.lax.scan
-    # Fused, XLA computes what a stage finds anew for each use of it, of which there are many
-    over_stages = _unrolled if form.states * form.unknowns <= _FUSED else jax.lax.scan
+    # Fused, XLA computes what a stage finds anew for each use of it, of which large slopes have
+    # many; and a large field is written once into a program
+    few = form.substeps <= (2 if learned else UNROLLED) and not (form.large and form.substeps > 1)
+    over_substeps = _unrolled if few else jax.lax.scan
+    small = form.states * form.unknowns <= _FUSED and not form.large
+    over_stages = _unrolled if small else jax.lax.scan
 
     def substep(x: Array, u: tuple[Array, ...]) -> tuple[Any, FieldSlopes]:
         def stage(rates: Array, given: tuple[Array, Array]) -> tuple[Any, FieldSlopes]:
@@ -273,8 +276,6 @@ def _finite(slope: Array) -> Array:
 
 
 _FEWER = 128  # rows per compiled call, where each calls the host
-_LARGE = 150
-# operations in the expressions of a motion: beyond, compiling its stages one by one takes a minute
 
 
 @dataclass(frozen=True)
@@ -399,7 +400,7 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             return sum(self.rates(numbers, state, now))
         exponentials = self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0]
         inputs, pace = self.split_pace(inputs)
-        h, large = pace * self.sampling_time / self.substeps, self._large
+        h, large = pace * self.sampling_time / self.substeps, self.large
         field = partial(_field, self, numbers)
         step = self.motion.scheme.step(field, h, exponentials, looped=large)
         held, external = len(self.motion.held), len(self.motion.external)
@@ -433,12 +434,8 @@ class MotionDynamics(MotionField, AutodiffDynamics):
         return Exponentials.of(self.linear_part(numbers), self.sampling_time / self.substeps)
 
     @property
-    def _large(self) -> bool:
-        return self.motion.size > _LARGE
-
-    @property
     def _by_stages(self) -> bool:
-        plain = self.substeps <= _MOST_KEPT and not self._large and not self.motion.held
+        plain = self.substeps <= _MOST_KEPT and not self.motion.held
         return self.motion.scheme.has_adjoint and plain and self.differentiable
 
     def tangents(

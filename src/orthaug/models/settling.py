@@ -23,6 +23,7 @@ _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 64, 16  # steps, and windows side by side
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
+_FEWEST = 8  # steps where each padded row is a call of the host
 _SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
@@ -37,14 +38,16 @@ class Windows(NamedTuple):
     scored: Any
     """Inputs of each window, (T, m)."""
 
-    def pad(self) -> tuple[Windows, int]:
-        """Return longer and more windows on the device, and T.
+    def pad(self, lanes: int, *, every_row: bool) -> tuple[Windows, int]:
+        """Return longer and more windows on the device, their number `lanes`, and T.
 
-        Few shapes have programs of their own.
+        Few shapes have programs of their own, fewer where `every_row` is False: a run then goes
+        through the first T rows alone.
         """
         steps, count = np.shape(self.scored)
-        length = padded_steps(steps) if count > _LANES else max(padded_steps(steps), _USUAL)
-        more = length - steps, -count % _LANES
+        usual = _USUAL if lanes <= _LANES else _SHORTEST
+        length = padded_steps(steps, _FEWEST if every_row else usual)
+        more = length - steps, lanes - count
 
         def repeat_last(part: np.ndarray) -> np.ndarray:
             return np.pad(
@@ -54,9 +57,16 @@ class Windows(NamedTuple):
         return Windows(*(jax.device_put(repeat_last(np.asarray(part))) for part in self)), steps
 
 
-def padded_steps(steps: int) -> int:
+def _padded_lanes(count: int, every_lane: bool) -> int:
+    """Return the number that windows are padded to, fewer where each is a call of the host."""
+    if every_lane and count < _LANES:
+        return 1 << (count - 1).bit_length()
+    return count + -count % _LANES
+
+
+def padded_steps(steps: int, shortest: int = _SHORTEST) -> int:
     """Return the length that the steps of a window are padded to."""
-    return max(_SHORTEST, 1 << (steps - 1).bit_length())
+    return max(shortest, 1 << (steps - 1).bit_length())
 
 
 def settle(
@@ -78,10 +88,11 @@ def settle(
         loose: (n0,) how far a state may be from there before that counts as much as one error.
     """
     count = np.shape(states)[1]
-    begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, -count % _LANES)), mode="edge")
+    lanes = _padded_lanes(count, form.calls_host)
+    begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, lanes - count)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / np.asarray(loose, dtype=float) ** 2
-    layout = windows.pad()  # once for all iterations
+    layout = windows.pad(lanes, every_row=form.calls_host)  # once for all iterations
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearise_windows(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):

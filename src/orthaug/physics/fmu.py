@@ -33,6 +33,7 @@ from orthaug.physics.sources import Description, FileSource, Functions, Quantity
 
 _STEP = np.finfo(float).eps ** (1 / 3)  # of central differences, against the size of a number
 _FLOOR = 0.1
+_EVERY = slice(None)
 _WIDER = 80.0  # times that are the steps of second differences, of slopes with noise of 1e-10
 _UNITS: dict[str, Unit] = {}
 _LOCK = threading.RLock()  # of all native code: FMUs need not be safe for threads
@@ -288,9 +289,9 @@ class Evaluation:
         if not len(z):
             return
         z = np.ascontiguousarray(z)
-        p = z[:, sum(self.widths[:2]) :]
-        if len(z) == 1 or (p == p[:1]).all():
-            yield slice(None), z, p[0]
+        p = z[:, len(self.unit.states) + len(self.inputs) :]
+        if len(z) == 1 or (p == p[0]).all():
+            yield _EVERY, z, p[0]
             return
         different, which = np.unique(p, axis=0, return_inverse=True)
         for i, own in enumerate(different):
