@@ -301,7 +301,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         found = {
             "excitation": identification.on_data,
             "identifiability": identification.by_any or identification.on_data,
-            "shared": shared,
+            "shared": shared and shared.beside_collinear(identification.on_data.collinear),
             "bias": self._bias_of_physics(job, trial) if full_rank else None,
             "motion": {
                 "states": motion.names_of_states,

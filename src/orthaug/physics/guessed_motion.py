@@ -111,11 +111,9 @@ class GuessedMotion:
 
     def _slopes(self, values: Vector, x: Any, u: Any) -> Float[np.ndarray, "m nx nx"]:
         """Return ∂f/∂x at states x (nx, k) and inputs u (nu, k), where it is finite."""
-        size = np.abs(self.guessed_points[0]).max(axis=1)
-        size = np.maximum(size, 1e-6 * size.max(initial=1e-6))
         columns = []
         with np.errstate(all="ignore"):
-            for i, h in enumerate(_STEP * size):
+            for i, h in enumerate(_STEP * self._sizes):
                 moved = np.zeros_like(x)
                 moved[i] = h
                 ends = (
@@ -124,6 +122,29 @@ class GuessedMotion:
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
         return slopes[np.isfinite(slopes).all(axis=(1, 2))]
+
+    @cached_property
+    def _sizes(self) -> Float[np.ndarray, "nx"]:
+        """Size of each state: the largest guess, and of one that is zero everywhere its first step.
+
+        Differences about zero need the latter: a step far below it is lost in the rounding of
+        what the inputs add. One pass reaches states that inputs drive, each further one the
+        states that those drive.
+        """
+        motion, (x, u) = self.motion, self.guessed_points
+        step = 1.0 if motion.scheme.discrete else self.record.sampling_time
+        size = np.abs(x).max(axis=1, initial=0.0)
+        silent = size[:, None] == 0
+        for _ in size:
+            still = size == 0
+            if not still.any():
+                break
+            at = np.where(silent, size[:, None], x)
+            with np.errstate(all="ignore"):
+                moved = step * np.abs(np.asarray(motion.rates(at, u, motion.initial, np)))
+            first = np.where(np.isfinite(moved), moved, 0.0).max(axis=1, initial=0.0)
+            size = np.where(still, first, size)
+        return np.maximum(size, 1e-6 * (size.max(initial=0.0) or 1.0))
 
     @property
     def fastest(self) -> float:
