@@ -59,7 +59,6 @@ ENTRIES = {
 CONCEPTS = {
     "_base.kept_programs": "traced programs on disk",
     "analysis.amplitude_dependence": "the nearest linear system over movements of some size",
-    "data.units": "units, read by a library",
     "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
     "physics.black_box": "functions of the host, with derivatives",
