@@ -249,8 +249,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
 
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         from orthaug.analysis.absorbed import Waves
-        from orthaug.analysis.imitation import imitation_before
         from orthaug.analysis.exchanged_inputs import misread_inputs
+        from orthaug.analysis.imitation import imitation_before
         from orthaug.analysis.input_timing import find_late_inputs, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
         from orthaug.analysis.other_solutions import find_other_solution
