@@ -20,6 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, without_gaps
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
+from orthaug.physics.parameters import rate_unit
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
 # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
@@ -200,6 +201,7 @@ class GuessedMotion:
                 f'the motion, {self.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} '
                 f"in a substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), "
                 "check units and initial values, or leave the fast mode out."
+                + _other_time(self.motion)
             )
         return ""
 
@@ -250,6 +252,17 @@ class GuessedMotion:
         return motion.scheme.first_substeps(self.fastest * self.record.longest_step)
 
 
+def _other_time(motion: Motion) -> str:
+    """Return a sentence on parameters that are rates, but not per second; empty without such."""
+    rate = rate_unit(parameter.unit for parameter in motion.parameters)
+    if rate == "1/s":
+        return ""
+    return (
+        f" Parameters are in {rate}: that needs a `sampling_time` in {rate[2:]}. A column of "
+        "`time` is read in seconds, whatever the unit in its header."
+    )
+
+
 def check_start(problem: GuessedMotion) -> None:
     """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
@@ -261,6 +274,7 @@ def check_start(problem: GuessedMotion) -> None:
             f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
             f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
             '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+            + _other_time(motion)
         )
     fault = problem.exponential_fault() if motion.scheme.splits_linear_part else ""
     if fault:
