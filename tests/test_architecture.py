@@ -65,7 +65,6 @@ CONCEPTS = {
     "physics.fmu": "a kind of source",
     "physics.fmu_instances": "the interface FMI, in both versions",
     "physics.mechanisms": "a kind of source",
-    "analysis.exchanged_inputs": "a mistake in the spec that the data show",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.observer": "the verb `observe`",
     "analysis.term_sensitivities": "slopes of a free run by terms that are added to it",
