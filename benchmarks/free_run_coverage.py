@@ -40,7 +40,13 @@ def coverage(pole: float, segment: int, draws: int) -> tuple[np.ndarray, np.ndar
     inside, default = np.zeros((2, len(THETA))), 0
     criterion = oa.Simulation(segment, 40)
     for seed in range(draws):
-        fit = oa.estimate(record(seed, pole), BASELINE, learner=None, criterion=criterion)
+        fit = oa.estimate(
+            record(seed, pole),
+            BASELINE,
+            learner=None,
+            criterion=criterion,
+            standard_errors="plain",
+        )
         default += (
             robust_where_asked(fit, fit.model.predict(fit.problem.record)).plain_covariance
             is not None

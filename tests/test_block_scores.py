@@ -219,3 +219,35 @@ def test_errors_that_never_forget_are_refused():
         fit.robust()
     with pytest.raises(InputError, match="`lags`"):
         fit.robust(0)
+
+
+def test_a_block_is_judged_by_the_fit_without_it():
+    """Of physics that is linear on the free run too, this is the jackknife, by refits in NumPy."""
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.uniform(-1, 1, 31), 10)[:301]
+    slow = np.cumsum(rng.normal(size=301)) * 0.1
+    phi = np.column_stack([u[:-1], np.arange(1, 301) / 300, np.ones(300)])
+    y = np.append(0.0, phi @ [2.0, 0.5, 1.0]) + slow
+    record = Record.from_arrays(
+        np.column_stack([u, np.arange(1, 302) / 300]),
+        y,
+        sampling_time=1.0,
+        inputs=["u", "t"],
+        outputs=["y"],
+    )
+    terms = [Term("b", "u[k-1]"), Term("drift", "t[k-1]"), Term("offset", "1")]
+    fit = estimate(
+        record,
+        Baseline.from_terms(terms),
+        learner=None,
+        criterion=Simulation(0, 0),
+    ).robust(60)
+    whole = np.linalg.lstsq(phi, y[1:], rcond=None)[0]
+    without = []
+    for j in range(5):
+        kept = np.arange(300) // 60 != j
+        without.append(np.linalg.lstsq(phi[kept], y[1:][kept], rcond=None)[0] - whole)
+    np.testing.assert_allclose(fit.theta, whole, rtol=1e-6)
+    np.testing.assert_allclose(
+        fit.std, np.sqrt(0.8 * np.sum(np.square(without), axis=0)), rtol=1e-6
+    )

@@ -341,6 +341,11 @@ def test_check_of_rank_deficient_physics_reports_and_exits_with_2(
         "collinear": [],
     }
     assert report["identifiability"]["identifiable"] is identifiable
+    project.write_text(
+        project.read_text().replace('kind = "none"', 'hidden = [2]\ninputs = ["y[k-1]"]')
+    )
+    shared = finite_json(run("check", project, "--json").out)["shared"]
+    assert "c" not in shared["determined"]  # it was, "with any learner of these inputs"
 
 
 def test_check_warns_of_rows_left_out(project):

@@ -150,7 +150,10 @@ def test_check_and_fit_name_it(tmp_path):
     )
     checked = json.loads(run("check", tmp_path / "loop.toml", "--json").out)
     assert "closed_loop" in [warning["code"] for warning in checked["warnings"]]
-    assert run("fit", tmp_path / "loop.toml", "--out", tmp_path / "result").code == 0
+    fitted = run("fit", tmp_path / "loop.toml", "--out", tmp_path / "result")
+    assert fitted.code == 0
+    said = " ".join(fitted.out.split())
+    assert "which biases the estimates" in said and "and to read" not in said  # was both at once
     result = json.loads((tmp_path / "result" / "result.json").read_text())
     assert [warning["code"] for warning in result["warnings"]].count("closed_loop") == 1
     assert (

@@ -598,6 +598,8 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
     told = strict(out)
     assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
     assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
+    assert told["shared"]["determined"] == []  # they were, "with any learner of these inputs"
+    assert "The data determine" not in told["shared"]["text"]
     assert told["motion"]["best_hold"] == "first-order"
     residuals = {held["hold"]: held["residual"] for held in told["motion"]["holds"]}
     assert residuals["first-order"] < 0.1 * residuals["zero-order"]
@@ -960,3 +962,34 @@ def test_opening_a_motion_loads_no_jax(folder):
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_the_fastest_mode_is_found_where_all_guesses_are_zero(tmp_path):
+    """The difference about zero was lost in the rounding of a large input: 0 1/s."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.uniform(-1, 1, 10), 6)
+    v = np.zeros(60)
+    for k in range(59):
+        v[k + 1] = v[k] + 0.01 * (3e6 * u[k] - 5 * v[k])
+    write = {"u": u, "y": v + 1e3 * rng.normal(size=60)}
+    pd.DataFrame(write).to_csv(tmp_path / "run.csv", index=False)
+    (tmp_path / "spec.toml").write_text(
+        """
+[data]
+sampling_time = 0.01
+inputs = ["u"]
+outputs = ["y"]
+train = "run.csv"
+[motion.states]
+v = { derivative = "3e6*u - c*v" }
+x = { derivative = "v - x" }
+[motion.outputs]
+y = "v + 0*x"
+[motion.parameters]
+c = { initial = 4.0, min = 0 }
+""",
+        encoding="utf-8",
+    )
+    code, out, err = orthaug("check", tmp_path / "spec.toml", "--json")
+    assert code == 0, err
+    assert strict(out)["motion"]["fastest"] == pytest.approx(4.0)

@@ -16,6 +16,7 @@ from orthaug.analysis.budget import Budget
 from orthaug.analysis.closed_loop import closed_loop, without_exchanged
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.doubts import doubt
+from orthaug.analysis.equation_units import equation_units
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores, parameter_rows
 from orthaug.analysis.informative_data import explains_nothing, few_frequencies
@@ -207,6 +208,7 @@ def _analyse(
             warnings[:] = [one for one in warnings if one.code != "no_standard_errors"]
         looped = closed_loop(evidence.train.record, evidence.method(fit.criterion))
         warnings[:] = [*without_exchanged(warnings, looped), *looped]
+        warnings += equation_units(evidence.train.record, fit.problem.physics)
         warnings += few_frequencies(evidence.train.record, len(fit.problem.names))
         fields |= analyse_physics(fit, evidence, one_step, free_run, warnings)
         budget = fields.pop("budget")

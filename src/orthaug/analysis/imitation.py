@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -73,6 +73,8 @@ class Imitation:
     """True if the learner can be linear combinations of its inputs only."""
     held: tuple[str, ...] = ()
     """Parameters at a bound: known terms, along which nothing is split off."""
+    inseparable: tuple[str, ...] = ()
+    """Parameters of which the data determine combinations only, with a learner and without."""
     weakest: tuple[str, float] | None = None
     """The determined parameter that a learner of terms comes nearest to, and what it leaves of its
     regressor.
@@ -82,6 +84,25 @@ class Imitation:
     def of(cls, inputs: Sequence[str], shared: SharedDirections, *others: Any) -> Self:
         """Return the imitation for the shared directions; `others` are the last fields."""
         return cls(tuple(inputs), shared.all, shared.directions, shared.untouched, *others)
+
+    def beside_collinear(self, groups: Iterable[Iterable[str]]) -> Self:
+        """Return it with the parameters of these groups as determined by no data.
+
+        Args:
+            groups: parameters whose effects depend linearly on each other.
+        """
+        lost = tuple(dict.fromkeys(name for group in groups for name in group))
+        others = tuple(
+            replace(other, determined=tuple(n for n in other.determined if n not in lost))
+            for other in self.alternatives
+        )
+        determined = tuple(name for name in self.determined if name not in lost)
+        return replace(self, determined=determined, alternatives=others, inseparable=lost)
+
+    @property
+    def _excepted(self) -> str:
+        """Names that the data do not determine with any learner; empty where there are none."""
+        return f" but {join_words(self.inseparable)}" if self.inseparable else ""
 
     @property
     def text(self) -> str:
@@ -103,7 +124,10 @@ class Imitation:
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
-            return f"{text}: the data determine every{rest} parameter{_PROVIDED}.{self._nearly}"
+            return (
+                f"{text}: the data determine every{rest} parameter{self._excepted}{_PROVIDED}."
+                f"{self._nearly}"
+            )
         could = join_words([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
@@ -160,7 +184,7 @@ class MotionImitation(Imitation):
         if not self.directions:
             return (
                 f"{sees} and could imitate no change of a parameter: the data determine all of "
-                f"them{_PROVIDED}.{self._remembered}"
+                f"them{self._excepted}{_PROVIDED}.{self._remembered}"
             )
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
         text = (

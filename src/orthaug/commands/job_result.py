@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from orthaug.analysis.closed_loop import closed_loop, without_exchanged
+from orthaug.analysis.equation_units import equation_units
 from orthaug.analysis.informative_data import few_frequencies
 from orthaug.commands.job import Job
 from orthaug.reports.result import CheckResult, FitResult
@@ -33,6 +34,7 @@ def check(job: Job) -> CheckResult:
             "warnings": [
                 *without_exchanged([*job.warnings, *warnings], looped),
                 *looped,
+                *equation_units(job.train.record, job.problem.physics),
                 *few_frequencies(job.train.record, len(job.problem.names)),
             ],
         }

@@ -248,7 +248,7 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
             "identifiability": identifiability(
                 problem.baseline, problem.layout, problem.outputs, problem.rows.x
             ),
-            "shared": shared,
+            "shared": shared and shared.beside_collinear(problem.excitation.collinear),
             "bias": self._bias(evidence) if problem.excitation.full_rank else None,
         }
         return found, [*ill_conditioned.of_physics(problem), *warnings]

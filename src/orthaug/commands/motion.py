@@ -249,6 +249,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
 
     def check(self, job: Job) -> tuple[dict[str, Any], list[Warning]]:
         from orthaug.analysis.absorbed import Waves
+        from orthaug.analysis.exchanged_inputs import misread_inputs
         from orthaug.analysis.imitation import imitation_before
         from orthaug.analysis.input_timing import find_late_inputs, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
@@ -290,7 +291,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         posed, waves = (problem, Waves()) if learns else (problem.without_learner(), None)
         trial = try_holds(posed, criterion, solver, structure, waves)
         text, warnings = _about_steps(problem, trial)
-        warnings += [late.warning for late in find_late_inputs(trial.task, solver)]
+        misread = misread_inputs(trial.task, solver)
+        late = () if misread else find_late_inputs(trial.task, solver)
+        warnings += [*misread, *(one.warning for one in late)]
         warnings += restart_warnings(trial.task.physics)
         if full_rank and trial.task.physics is not None:  # else there are others anyway
             q = trial.task.physics.end.point.theta
@@ -301,7 +304,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         found = {
             "excitation": identification.on_data,
             "identifiability": identification.by_any or identification.on_data,
-            "shared": shared,
+            "shared": shared and shared.beside_collinear(identification.on_data.collinear),
             "bias": self._bias_of_physics(job, trial) if full_rank else None,
             "motion": {
                 "states": motion.names_of_states,

@@ -7,6 +7,11 @@ of many steps, `Ω = Σ_j B_j B_jᵀ` estimates the covariance of the whole sum,
 p̂. To first order that is Newey and West's estimate with as many lags as a block has steps (Andrews
 1991); in the words of cluster-robust errors (Liang and Zeger 1986) a block is a cluster.
 
+The fit bends towards the errors of each block, the more so the fewer blocks there are for its
+parameters, so that B_j is smaller than it would be at the true p. With M_j the information of the
+block, `M (M − M_j)⁻¹ B_j` is its score at the fit without it: the jackknife over blocks (CR3 of
+Bell and McCaffrey 2002), with `(J − 1)/J` in Ω.
+
 The state that a segment starts from is an unknown too. It is eliminated from every step alike, with
 χ_k the sensitivity to it: `s_k − S_px S_xx⁻¹ χ_k`, the Schur complement of M. That is linear in the
 steps, so it can follow the sum over a block. What the measured state adds counts to the first block
@@ -23,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
@@ -31,10 +36,14 @@ from orthaug.data.record import Record
 from orthaug.fitting.colour import autoregression, correlation_length
 from orthaug.fitting.objective import errors_of
 from orthaug.fitting.segments import Segments, begins_of, block_scores, packed, respond
+from orthaug.inference.influence import LARGEST
 from orthaug.models.dynamics import Dynamics, Numbers
-from orthaug.models.statistics import Statistics
+from orthaug.models.statistics import Statistics, half_inverse
 
 _MEMORIES = 3  # times as many steps in a block as the errors' correlation lasts
+# Share of a direction's information that the other blocks hold at least. A block that determines
+# a direction alone has no error along it, and nothing would be divided by nothing.
+_LEFT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +103,7 @@ class FreeRunScores:
 
         No block is shorter where the segment has as many steps.
         """
-        scored = np.asarray(self.segments.scored)
-        first = int(np.argmax(scored.any(axis=(0, 2))))
-        count = max(self.longest // steps, 1)
-        place = np.maximum(np.arange(self.segments.steps) - first, 0) // -(-self.longest // count)
+        scored, place = np.asarray(self.segments.scored), self._places(steps)
         made = (self.dynamics, self.numbers, self.segments, self.states, self.weight)
         sums = np.moveaxis(
             np.asarray(block_scores(*made, place.astype(np.int32), int(place[-1]) + 1)), -1, 1
@@ -112,6 +118,12 @@ class FreeRunScores:
             [scored[:, place == block].sum(axis=1) for block in range(int(place[-1]) + 1)], axis=-1
         )
         return scores[counts > 0]
+
+    def _places(self, steps: int) -> Int[np.ndarray, "T"]:
+        """Return the block of each step of a segment, counted from 0."""
+        first = int(np.argmax(np.asarray(self.segments.scored).any(axis=(0, 2))))
+        count = max(self.longest // steps, 1)
+        return np.maximum(np.arange(self.segments.steps) - first, 0) // -(-self.longest // count)
 
     def by_recording(self, record: Record, washout: int) -> Float[np.ndarray, "E n"] | None:
         """Return the score of every recording, in the units of the model's Gram matrix.
@@ -173,16 +185,40 @@ class FreeRunScores:
         there = errors[np.moveaxis(self.segments.complete, -1, 1)]
         return np.sqrt(self.unit) * there @ self.weight.T
 
-    def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
+    def middle(
+        self, steps: int, used: float, information: Matrix | None = None, nt: int = 0
+    ) -> tuple[Matrix, int]:
         """Return Ω of p in the units of the model's Gram matrix, and its number of blocks.
 
         Args:
             used: parameters of the fit, by which its errors are too small.
+            information: M with the precisions of the prior, of all of training; with it the
+                scores are those of fits without their block, if the slopes fit into memory.
+            nt: number of θ, the leading entries of p.
         """
-        scores = self.blocks(steps)
+        scores = self.unit * self.blocks(steps)
         blocks, rows = len(scores), self.share * float(self.segments.observations.sum())
-        correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
-        return self.share * correction * self.unit**2 * scores.T @ scores, blocks
+        grams = None if information is None else self._grams(steps, len(information))
+        if grams is None or len(grams) != blocks:
+            correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
+            return self.share * correction * scores.T @ scores, blocks
+        half = half_inverse(information, nt)
+        values, vectors = np.linalg.eigh(half.T @ grams @ half)
+        own = np.einsum("bri,br->bi", vectors, scores @ half) / np.maximum(1 - values, _LEFT)
+        without = np.einsum("bri,bi->br", vectors, own) @ (information @ half).T
+        return self.share * (blocks - 1) / blocks * without.T @ without, blocks
+
+    def _grams(self, steps: int, n: int) -> Float[np.ndarray, "b n n"] | None:
+        """Return the information of each of `blocks`; None where it is too large for memory."""
+        there = np.moveaxis(self.segments.complete, -1, 1)  # (k, m, T)
+        place, ny = self._places(steps), self.segments.target.shape[2]
+        segments, blocks = there.shape[0] * there.shape[1], int(place[-1]) + 1
+        if n * max(there.size * ny, segments * blocks * n) > LARGEST:
+            return None
+        owner = np.arange(segments).reshape(*there.shape[:2], 1) * blocks + place
+        ends = np.flatnonzero(np.diff(owner[there])) + 1
+        parts = [part.reshape(-1, n) for part in np.split(self.slopes(), ends)]
+        return np.stack([part.T @ part for part in parts])
 
     def coloured_middle(self, used: float) -> tuple[Matrix, float]:
         """Return Ω of p under autoregressive errors, and their independent number.
@@ -224,6 +260,7 @@ class FreeRunScores:
         freedom: float,
         used: float,
         steps: int | None,
+        nt: int,
         *,
         modelled: bool = False,
     ) -> Statistics:
@@ -235,6 +272,7 @@ class FreeRunScores:
             statistics, freedom: of errors that are white.
             used: parameters of the fit.
             steps: of a block.
+            nt: number of θ, the leading entries of p.
             modelled: take the errors for an autoregressive process instead of blocks.
 
         Raises:
@@ -251,5 +289,5 @@ class FreeRunScores:
                 "the errors of the free run are correlated over too many steps for blocks; use "
                 "a longer record."
             )
-        middle, blocks = self.middle(steps, used)
+        middle, blocks = self.middle(steps, used, statistics.information(nt), nt)
         return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

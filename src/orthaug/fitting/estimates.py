@@ -248,7 +248,8 @@ class Estimate(FitView):
         steps = None if lags is None else check_count(lags, "lags")
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
-        own = self.scores.robust(statistics, self.freedom, used, steps, modelled=modelled)
+        nt = len(self.theta)
+        own = self.scores.robust(statistics, self.freedom, used, steps, nt, modelled=modelled)
         return replace(self._with_statistics(own, kind), freedom=own.freedom)._renewed()
 
     def _check_not_withheld(self) -> None:

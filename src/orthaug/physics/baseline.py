@@ -247,6 +247,16 @@ class Baseline(NotebookView):
             [p.max for p in self.parameters]
         )
 
+    @property
+    def state_units(self) -> dict[str, str]:
+        """Units of states: lagged physics has none."""
+        return {}
+
+    @property
+    def measured_states(self) -> dict[str, str]:
+        """The states that outputs are: lagged physics has none."""
+        return {}
+
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
         """The parsed regressor of each term."""

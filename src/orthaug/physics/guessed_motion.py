@@ -20,6 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, without_gaps
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
+from orthaug.physics.parameters import rate_unit
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
 # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
@@ -111,11 +112,9 @@ class GuessedMotion:
 
     def _slopes(self, values: Vector, x: Any, u: Any) -> Float[np.ndarray, "m nx nx"]:
         """Return ∂f/∂x at states x (nx, k) and inputs u (nu, k), where it is finite."""
-        size = np.abs(self.guessed_points[0]).max(axis=1)
-        size = np.maximum(size, 1e-6 * size.max(initial=1e-6))
         columns = []
         with np.errstate(all="ignore"):
-            for i, h in enumerate(_STEP * size):
+            for i, h in enumerate(_STEP * self._sizes):
                 moved = np.zeros_like(x)
                 moved[i] = h
                 ends = (
@@ -124,6 +123,29 @@ class GuessedMotion:
                 columns.append((next(ends) - next(ends)) / (2 * h))
         slopes = np.moveaxis(np.stack(columns, axis=1), -1, 0)
         return slopes[np.isfinite(slopes).all(axis=(1, 2))]
+
+    @cached_property
+    def _sizes(self) -> Float[np.ndarray, "nx"]:
+        """Size of each state: the largest guess, and of one that is zero everywhere its first step.
+
+        Differences about zero need the latter: a step far below it is lost in the rounding of
+        what the inputs add. One pass reaches states that inputs drive, each further one the
+        states that those drive.
+        """
+        motion, (x, u) = self.motion, self.guessed_points
+        step = 1.0 if motion.scheme.discrete else self.record.sampling_time
+        size = np.abs(x).max(axis=1, initial=0.0)
+        silent = size[:, None] == 0
+        for _ in size:
+            still = size == 0
+            if not still.any():
+                break
+            at = np.where(silent, size[:, None], x)
+            with np.errstate(all="ignore"):
+                moved = step * np.abs(np.asarray(motion.rates(at, u, motion.initial, np)))
+            first = np.where(np.isfinite(moved), moved, 0.0).max(axis=1, initial=0.0)
+            size = np.where(still, first, size)
+        return np.maximum(size, 1e-6 * (size.max(initial=0.0) or 1.0))
 
     @property
     def fastest(self) -> float:
@@ -179,6 +201,7 @@ class GuessedMotion:
                 f'the motion, {self.fastest:.3g} 1/s, also of `integrator = "exact"`: {fast:.3g} '
                 f"in a substep, at most {_FASTEST}. Give `substeps` (at most {MOST_SUBSTEPS}), "
                 "check units and initial values, or leave the fast mode out."
+                + _other_time(self.motion)
             )
         return ""
 
@@ -229,6 +252,17 @@ class GuessedMotion:
         return motion.scheme.first_substeps(self.fastest * self.record.longest_step)
 
 
+def _other_time(motion: Motion) -> str:
+    """Return a sentence on parameters that are rates, but not per second; empty without such."""
+    rate = rate_unit(parameter.unit for parameter in motion.parameters)
+    if rate == "1/s":
+        return ""
+    return (
+        f" Parameters are in {rate}: that needs a `sampling_time` in {rate[2:]}. A column of "
+        "`time` is read in seconds, whatever the unit in its header."
+    )
+
+
 def check_start(problem: GuessedMotion) -> None:
     """Raise InputError where equations have no value at the start, or a mode is too fast."""
     motion, where = problem.motion, problem.without_value(np.all)
@@ -240,6 +274,7 @@ def check_start(problem: GuessedMotion) -> None:
             f"fastest mode of the motion, {problem.fastest:.3g} 1/s: it needs "
             f"{problem.substeps} substeps, but at most {MOST_SUBSTEPS} are allowed. Use "
             '`integrator = "exact"`, check units and initial values, or leave the fast mode out.'
+            + _other_time(motion)
         )
     fault = problem.exponential_fault() if motion.scheme.splits_linear_part else ""
     if fault:

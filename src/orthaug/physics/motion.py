@@ -379,6 +379,25 @@ class Motion(NotebookView):
         return ()
 
     @property
+    def expressions(self) -> tuple[Expression, ...]:
+        """Every expression of the physics; none of a motion with functions."""
+        if self.functions is not None:
+            return ()
+        defined = (one for _, one in self.definitions)
+        return (*self.equations.values(), *defined, *self.observations)
+
+    @property
+    def state_units(self) -> dict[str, str]:
+        """The declared unit of each state."""
+        return {state.name: state.unit for state in self.states}
+
+    @property
+    def measured_states(self) -> dict[str, str]:
+        """The state that each output is, where its expression is the state alone."""
+        texts = {output.name: (output.expression or "").strip() for output in self.outputs}
+        return {name: text for name, text in texts.items() if text in self.names_of_states}
+
+    @property
     def differences(self) -> tuple[tuple[str, str], ...]:
         """Pairs of names a, b whose difference a − b occurs in an expression, each once.
 

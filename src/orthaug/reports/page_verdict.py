@@ -381,7 +381,7 @@ _MEND_FIRST = "Mend the data first, as the warnings say, and fit again."
 # What is wrong with data looks like missing physics, which a search would then find
 _DEFECTS = (
     *("exchanged_columns", "held_output", "reset_output", "rows_twice", "saturated_output"),
-    *("unit_mismatch", "wild_rows", "wild_samples", "wrapped_angle"),
+    *("equation_units", "unit_mismatch", "wild_rows", "wild_samples", "wrapped_angle"),
 )
 _UNTESTED = {
     "explains_nothing": "its free run explains nothing of an output",
@@ -401,6 +401,7 @@ _UNTESTED = {
     "held_output": "a sensor is slower than the rows of its data",
     "exchanged_columns": "an input and an output may be exchanged",
     "saturated_output": "an output is recorded at an end of its range",
+    "equation_units": "its equations and its data are in different units",
     "wild_rows": "a few rows, which may be wrong, decide its parameters",
     "short_for_noise": "its record is too short to distinguish noise from disturbances that last",
 }
@@ -411,7 +412,8 @@ def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
     sure = [row.name for row in rows if _is_known(row)]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
-    known = sure if _noise_alone(result) and not untested else []
+    doubted = untested or _is_biased_by_feedback(result)
+    known = sure if _noise_alone(result) and not doubted else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
     ahead, part = _worst_score(result.scores, "prediction")

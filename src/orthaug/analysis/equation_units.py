@@ -1,0 +1,166 @@
+"""Units of equations against those of the data: states that outputs measure, and angles."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+from orthaug._base.errors import Warning
+from orthaug.data.channels import Channel
+from orthaug.data.expressions import Expression
+from orthaug.data.record import Record
+from orthaug.data.units import conversion
+from orthaug.physics.parameters import rate_unit
+
+_OF_ANGLES = ("sin", "cos", "tan")
+_SECONDS = {"min": 60, "h": 3600, "hr": 3600, "hour": 3600, "d": 86400, "day": 86400}
+_NEAR = 0.01  # relative error of a factor that was rounded
+
+
+class Written(Protocol):
+    """Physics as its expressions; without any where it is a function."""
+
+    @property
+    def expressions(self) -> tuple[Expression, ...]:
+        """Every expression of the physics."""
+        ...
+
+    @property
+    def parameters(self) -> Sequence[Any]:
+        """The parameters, with their units."""
+        ...
+
+    @property
+    def constants(self) -> tuple[tuple[str, float], ...]:
+        """The constants that expressions may use."""
+        ...
+
+    @property
+    def state_units(self) -> dict[str, str]:
+        """Unit of each state; of lagged physics, which has none, empty."""
+        ...
+
+    @property
+    def measured_states(self) -> dict[str, str]:
+        """The state that each output is, where its expression is the state alone."""
+        ...
+
+
+def equation_units(record: Record, physics: Written) -> list[Warning]:
+    """Return a warning for each quantity whose unit in the data is not that of the equations.
+
+    Two cases are certain, beside `rates_in_other_time`: an output that is a state of another
+    declared unit, and the sine, cosine or tangent of a quantity in degrees. A unit that is not
+    declared is never guessed.
+    """
+    channels = {channel.name: channel for channel in record.channels}
+    measured = {state: channels[out] for out, state in physics.measured_states.items()}
+    found = list(_other_than_states(measured, physics.state_units))
+    doubted = {name for name, _ in found}
+    angles = {
+        name: channel
+        for name, channel in (channels | measured).items()
+        if channel.name not in doubted and _degrees(channel)
+    }
+    found += _sines_of_degrees(physics.expressions, angles)
+    return [Warning("equation_units", text) for _, text in found]
+
+
+def rates_in_other_time(physics: Written) -> list[Warning]:
+    """Return a warning where rates are not per second, of a record whose instants are in seconds.
+
+    An equation with the ratio of the two units in it converts them itself.
+    """
+    if not physics.state_units:  # coefficients of lagged values are no rates
+        return []
+    rate = rate_unit(parameter.unit for parameter in physics.parameters)
+    seconds = _SECONDS.get(rate.removeprefix("1/"), 1)
+    numbers = {
+        node.value
+        for expression in physics.expressions
+        for node in ast.walk(expression.tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float)
+    } | {value for _, value in physics.constants}
+    if seconds == 1 or any(
+        math.isclose(n * r, 1, rel_tol=_NEAR) for n in numbers for r in (seconds, 1 / seconds)
+    ):
+        return []
+    text = (
+        f"parameters are in {rate}, and the column of `time` is read in seconds, whatever the unit "
+        "in its header. The equations are then per second: a fitted value is "
+        f"{seconds} times too small for its unit. Give the parameters in 1/s, or leave out `time` "
+        f"and give `sampling_time` in {rate[2:]}."
+    )
+    return [Warning("equation_units", text)]
+
+
+def _other_than_states(
+    measured: dict[str, Channel], units: dict[str, str]
+) -> Iterator[tuple[str, str]]:
+    """Yield the outputs that are states of another unit: their names, and what to do."""
+    for state, channel in measured.items():
+        unit = units.get(state, "")
+        if not unit or not channel.unit or unit == channel.unit:
+            continue
+        both = f"the output '{channel.name}' is in {channel.unit}, and its expression, the state "
+        both += f"'{state}', is in {unit}"
+        try:
+            right = conversion(channel.unit, unit)
+        except ValueError:
+            text = f"{both}: units of different kinds. Correct the unit, or the expression."
+            yield channel.name, text
+            continue
+        if right is None or math.isclose(right.scale, 1.0, rel_tol=1e-6):
+            continue
+        yield (
+            channel.name,
+            f"{both}. The parameters absorb such a factor. Give `data.channels.{channel.name}` "
+            f'`unit = "{unit}"` and `scale = {channel.scale * right.scale:.6g}`, or write '
+            f'`{channel.name} = "{1 / right.scale:.6g}*{state}"`. If only the unit is wrong, '
+            "correct it.",
+        )
+
+
+def _degrees(channel: Channel) -> bool:
+    """Return whether a channel is in degrees; not with a scale that makes radians of them."""
+    plain = channel.unit.strip().lower() in ("deg", "°", "degree", "degrees")
+    return plain and not math.isclose(abs(channel.scale), math.pi / 180, rel_tol=_NEAR)
+
+
+def _sines_of_degrees(
+    expressions: tuple[Expression, ...], angles: dict[str, Channel]
+) -> Iterator[tuple[str, str]]:
+    """Yield each channel in degrees of which a sine is taken, unconverted, and what to do."""
+    said = set()
+    for expression in expressions:
+        for node in ast.walk(expression.tree):
+            match node:
+                case ast.Call(ast.Name(function), [argument]) if function in _OF_ANGLES:
+                    for name in _unconverted(argument):
+                        channel = angles.get(name)
+                        if channel is None or channel.name in said:
+                            continue
+                        said.add(channel.name)
+                        scale = channel.scale * math.pi / 180
+                        yield (
+                            channel.name,
+                            f"{ast.unparse(node)} takes radians, and {channel.name} is in "
+                            f"{channel.unit}. The physics is then another one. Give "
+                            f'`data.channels.{channel.name}` `unit = "rad"` and '
+                            f"`scale = {scale:.6g}`, or write "
+                            f"{function}({math.pi / 180:.6g}*({ast.unparse(argument)})).",
+                        )
+
+
+def _unconverted(node: ast.expr) -> Iterator[str]:
+    """Yield the names of which an argument is a sum: a product or a quotient may convert units."""
+    match node:
+        case ast.Name(name) | ast.Subscript(ast.Name(name)):
+            yield name
+        case ast.UnaryOp(_, operand):
+            yield from _unconverted(operand)
+        case ast.BinOp(left, ast.Add() | ast.Sub(), right):
+            yield from _unconverted(left)
+            yield from _unconverted(right)
