@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterator
+from typing import Protocol
 
 from orthaug._base.errors import Warning
 from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Record
 from orthaug.data.units import conversion
-from orthaug.physics.parameters import rate_unit
 
 _OF_ANGLES = ("sin", "cos", "tan")
-_SECONDS = {"min": 60, "h": 3600, "hr": 3600, "hour": 3600, "d": 86400, "day": 86400}
 _NEAR = 0.01  # relative error of a factor that was rounded
 
 
@@ -25,16 +23,6 @@ class Written(Protocol):
     @property
     def expressions(self) -> tuple[Expression, ...]:
         """Every expression of the physics."""
-        ...
-
-    @property
-    def parameters(self) -> Sequence[Any]:
-        """The parameters, with their units."""
-        ...
-
-    @property
-    def constants(self) -> tuple[tuple[str, float], ...]:
-        """The constants that expressions may use."""
         ...
 
     @property
@@ -51,9 +39,8 @@ class Written(Protocol):
 def equation_units(record: Record, physics: Written) -> list[Warning]:
     """Return a warning for each quantity whose unit in the data is not that of the equations.
 
-    Two cases are certain, beside `rates_in_other_time`: an output that is a state of another
-    declared unit, and the sine, cosine or tangent of a quantity in degrees. A unit that is not
-    declared is never guessed.
+    Two cases are certain: an output that is a state of another declared unit, and the sine, cosine
+    or tangent of a quantity in degrees. A unit that is not declared is never guessed.
     """
     channels = {channel.name: channel for channel in record.channels}
     measured = {state: channels[out] for out, state in physics.measured_states.items()}
@@ -66,34 +53,6 @@ def equation_units(record: Record, physics: Written) -> list[Warning]:
     }
     found += _sines_of_degrees(physics.expressions, angles)
     return [Warning("equation_units", text) for _, text in found]
-
-
-def rates_in_other_time(physics: Written) -> list[Warning]:
-    """Return a warning where rates are not per second, of a record whose instants are in seconds.
-
-    An equation with the ratio of the two units in it converts them itself.
-    """
-    if not physics.state_units:  # coefficients of lagged values are no rates
-        return []
-    rate = rate_unit(parameter.unit for parameter in physics.parameters)
-    seconds = _SECONDS.get(rate.removeprefix("1/"), 1)
-    numbers = {
-        node.value
-        for expression in physics.expressions
-        for node in ast.walk(expression.tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float)
-    } | {value for _, value in physics.constants}
-    if seconds == 1 or any(
-        math.isclose(n * r, 1, rel_tol=_NEAR) for n in numbers for r in (seconds, 1 / seconds)
-    ):
-        return []
-    text = (
-        f"parameters are in {rate}, and the column of `time` is read in seconds, whatever the unit "
-        "in its header. The equations are then per second: a fitted value is "
-        f"{seconds} times too small for its unit. Give the parameters in 1/s, or leave out `time` "
-        f"and give `sampling_time` in {rate[2:]}."
-    )
-    return [Warning("equation_units", text)]
 
 
 def _other_than_states(

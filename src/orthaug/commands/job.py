@@ -17,7 +17,6 @@ from orthaug import __version__
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.parallel import Threads
 from orthaug._base.progress import SILENT, Plan, Progress
-from orthaug.analysis.equation_units import rates_in_other_time
 from orthaug.analysis.evidence import DEFAULT_BLOCKS, Evidence, sample_warnings
 from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec, load_spec
@@ -346,9 +345,7 @@ class Job:
             record = self.train.record
             names = [channel.name for channel in record.channels]
             of_parts = of_free_run(of_parts, record.prepared, names)
-        timed = self.spec.data.time is not None
-        rates = rates_in_other_time(self.problem.physics) if timed else []
-        return (*of_parts, *self._of_samples, *self.left_out, *rates)
+        return (*of_parts, *self._of_samples, *self.left_out)
 
     @cached_property
     def _of_samples(self) -> tuple[Warning, ...]:

@@ -20,7 +20,7 @@ from orthaug._base.errors import InputError
 from orthaug.data.expressions import Lag
 from orthaug.data.record import Record, without_gaps
 from orthaug.physics.motion import MOST_SUBSTEPS, Motion
-from orthaug.physics.parameters import rate_unit
+from orthaug.physics.parameters import time_unit
 
 _LOOKED_AT = 200  # rows at which the equations are looked at
 # [rad] in a sample, of a mode that lasts: beyond, every start is in another minimum
@@ -254,12 +254,12 @@ class GuessedMotion:
 
 def _other_time(motion: Motion) -> str:
     """Return a sentence on parameters that are rates, but not per second; empty without such."""
-    rate = rate_unit(parameter.unit for parameter in motion.parameters)
-    if rate == "1/s":
+    unit = time_unit(parameter.unit for parameter in motion.parameters)
+    if unit == "s":
         return ""
     return (
-        f" Parameters are in {rate}: that needs a `sampling_time` in {rate[2:]}. A column of "
-        "`time` is read in seconds, whatever the unit in its header."
+        f" Parameters are in 1/{unit}: that needs a `sampling_time` in {unit}. A column of `time` "
+        "with a unit in its header is read in seconds."
     )
 
 
