@@ -25,11 +25,13 @@ from orthaug.fitting.rules import ridge_of
 from orthaug.fitting.segmented_problem import FreeRunFit, SegmentedProblem
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.minimize import LEARNED, Descent
+from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
 from orthaug.inference.covariance import theta_block
 from orthaug.models.learners import Bound, remembers
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
+_CLEARLY = 4.0  # −2 log L for each weight: what more weights must gain
 
 
 class StartPoint(NamedTuple):
@@ -187,13 +189,18 @@ class SimulationTask(ABC):
         # The weights of a memory are needed only when others have grown: too late for evidence
         if not (evidence and remembers(self.bound.learner)):
             first = plan.descend(objective, best.p, solver, report, best.states, **kept, **options)
-            if not evidence or _lowers_loss(first, best.loss):
+            if not evidence or first.ending is Ending.STOPPED:
                 return self._below_physics(first)
         free = plan.descend(objective, best.p, solver.within_limit, report, best.states, **kept)
         if not _lowers_loss(free, best.loss):
             return self._below_physics(free if first is None else first)
+        learned = first is not None and _lowers_loss(first, best.loss)
+        if first is not None and learned and not self._is_clearly_better(free, first):
+            return self._below_physics(first)
         point, options = free.end.point, options | {"evidence_settled": False}
         again = plan.descend(objective, point.p, solver, report, point.states, **kept, **options)
+        if first is not None and learned and not self._is_clearly_better(again, first):
+            return self._below_physics(first)
         chosen = again if _lowers_loss(again, best.loss) else free if first is None else first
         if chosen is not free:
             spent = {
@@ -202,6 +209,18 @@ class SimulationTask(ABC):
             }
             chosen = chosen._replace(**spent)
         return self._below_physics(chosen)
+
+    def _is_clearly_better(self, one: FreeRunFit, by_evidence: FreeRunFit) -> bool:
+        """Return whether a run explains more than its weights would explain of noise.
+
+        Evidence that begins at a silent learner may settle with a few weights although others
+        explain far more. Of white noise each further weight takes one from −2 log L.
+        """
+        if not one.ending.usable or not by_evidence.ending.usable:
+            return False
+        gain = self.plan.residuals * np.log(by_evidence.mean_square / one.mean_square)
+        more = max(1.0, one.effective - by_evidence.effective)
+        return bool(gain > _CLEARLY * more)
 
     def _below_physics(self, free_fit: FreeRunFit) -> FreeRunFit:
         """Return the run, or its best iterate, so that it is not above physics alone.
