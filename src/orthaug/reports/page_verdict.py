@@ -412,7 +412,7 @@ def _use_text(result: FitResult, level: str) -> str:
     rows = _rows(result)
     sure = [row.name for row in rows if _is_known(row)]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
-    doubted = untested or _is_biased_by_feedback(result)
+    doubted = untested or is_biased_by_feedback(result)
     known = sure if _noise_alone(result) and not doubted else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
