@@ -177,7 +177,7 @@ def fitted_example(name: str, part: str) -> tuple[Any, Any, np.ndarray | None]:
     import orthaug as oa
 
     if not (ROOT / "examples" / "generated").is_dir():
-        generate.main()
+        generate.write(ROOT / "examples" / "generated")
     fitted = oa.fit_spec(ROOT / "examples" / f"{name}.toml")
     part = f"tests.{part}"
     run = fitted.responses[part][1].trajectories[0]
