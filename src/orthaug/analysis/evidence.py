@@ -160,8 +160,10 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
     found = _unread(problem)
     if isinstance(problem, Problem):
         return [*found, *data_warnings(problem.record, partial(fit_without, problem))]
-    found += _other_times(problem.motion, problem.record.time_column)
-    set_by_controller = problem.motion.held if isinstance(problem, MotionProblem) else ()
+    set_by_controller: Sequence[str] = ()
+    if isinstance(problem, MotionProblem):
+        found += _other_times(problem.motion, problem.record.time_column)
+        set_by_controller = problem.motion.held
     return [*found, *data_warnings(problem.record, limited=set_by_controller)]
 
 

@@ -210,7 +210,7 @@ def find_change(
     shares = known if drift is None else [*known, drift.share]
     if slow is not None and slow.share > (1 + CLEARLY) * max(shares, default=0.0):
         drift = slow
-    if drift is None or drift is not slow:
+    if slow is None or drift is not slow:
         return None if drift is None else _change_of(candidates, drift.tests, drift.best)
     return _without_past(candidates, slow, depending)
 
@@ -329,8 +329,10 @@ def _change_of(candidates: Candidates, tests: Tests, best: FamilyTest) -> Parame
         if best.kind == _DEPENDING:
             low, high = family.ranges[0]
             values = tuple(map(float, (*ends, middle)))
-            on = {"on": best.equation, "at": (low, (low + high) / 2, high)}
-            return ParameterDrift(place, best.share, *values[:2], turn=values[2], **on)
+            at = low, (low + high) / 2, high
+            return ParameterDrift(
+                place, best.share, values[0], values[1], turn=values[2], on=best.equation, at=at
+            )
         turn = _turn_of(float(middle), float(linear), float(square))
     else:
         low, high = family.ranges[chosen[0]]

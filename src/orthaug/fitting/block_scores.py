@@ -199,7 +199,7 @@ class FreeRunScores:
         scores = self.unit * self.blocks(steps)
         blocks, rows = len(scores), self.share * float(self.segments.observations.sum())
         grams = None if information is None else self._grams(steps, len(information))
-        if grams is None or len(grams) != blocks:
+        if information is None or grams is None or len(grams) != blocks:
             correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
             return self.share * correction * scores.T @ scores, blocks
         half = half_inverse(information, nt)

@@ -606,7 +606,7 @@ class Bound:
         then contiguous over rows, which is 2.5 times faster here than rows first.
         """
         values, kept = self.run(w, z)
-        scaled = sum(gain[:, i] * values[i] for i in range(self.ny))
+        scaled: Any = sum(gain[:, i] * values[i] for i in range(self.ny))
         to_leaves, _ = self.pull(w, kept, gain)
         return scaled, jnp.moveaxis(self.columns(to_leaves, gain), 0, 1)
 

@@ -125,11 +125,12 @@ def _through_learner(
     form: MotionField, numbers: Numbers, rows: Float[Array, "s nx ny m"], kept: Any
 ) -> Float[Array, "nx nw m"]:
     """Return the sum over stages of rows · ∂f/∂w."""
-    pulled = []
+    pulled: list[list[Array]] = []
     for i, own in enumerate(rows):
         at_stage = jax.tree.map(lambda part, i=i: part[i], kept)
         pulled.append(form.bound.pull(numbers.weights, at_stage, own)[0])
-    return form.bound.columns([sum(parts) for parts in zip(*pulled, strict=True)], rows[0])
+    summed: list[Any] = [sum(parts) for parts in zip(*pulled, strict=True)]
+    return form.bound.columns(summed, rows[0])
 
 
 def _unrolled(function: Any, carry: Any, given: Any, *, reverse: bool = False) -> tuple[Any, Any]:
@@ -202,7 +203,7 @@ def _learner_rows(
 def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) -> Slopes:
     """Return y and its slopes at m points, of states and inputs."""
     coordinates, (states, outputs) = form.motion.coordinates, form.corrected
-    u = jax.vmap(form.now, -1, -1)(inputs)
+    u: Any = jax.vmap(form.now, -1, -1)(inputs)
 
     def physics(x: Array, u: Array) -> tuple[Any, Any, Any]:
         def observed(x: Array, c: Array) -> Array:
