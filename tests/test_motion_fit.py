@@ -271,7 +271,7 @@ def test_no_learner_ends_above_physics_alone(seed: int) -> None:
 
 def test_where_the_learner_does_not_help_the_result_is_physics_alone() -> None:
     fit = oa.estimate(
-        data(160, friction=0.0, noise=0.2),
+        data(160, friction=0.0, noise=0.2, seed=2),
         spring(learned=True),
         learner=oa.MLP((12,), inputs=("x", "v")),
         criterion=oa.Simulation(80, 0),
