@@ -533,8 +533,7 @@ def test_what_stands_at_a_bound_is_a_constant_to_the_others() -> None:
     )
     fixed = oa.Motion.from_equations(**given, parameters=low, constants={"k": 20.0})
     one, other = (
-        oa.estimate(data(), made, learner=None, criterion=WHOLE, standard_errors="plain")
-        for made in (bounded, fixed)
+        oa.estimate(data(), made, learner=None, criterion=WHOLE) for made in (bounded, fixed)
     )
     assert set(one.at_bound) == {"k"} and one.unidentified == () and np.isnan(one.std[2])
     np.testing.assert_allclose(one.values[:2], other.values, rtol=1e-4)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError
@@ -185,28 +185,41 @@ class FreeRunScores:
         there = errors[np.moveaxis(self.segments.complete, -1, 1)]
         return np.sqrt(self.unit) * there @ self.weight.T
 
-    def middle(
-        self, steps: int, used: float, information: Matrix | None = None, nt: int = 0
-    ) -> tuple[Matrix, int]:
+    def middle(self, steps: int, used: float) -> tuple[Matrix, int]:
         """Return Ω of p in the units of the model's Gram matrix, and its number of blocks.
 
         Args:
             used: parameters of the fit, by which its errors are too small.
-            information: M with the precisions of the prior, of all of training; with it the
-                scores are those of fits without their block, if the slopes fit into memory.
-            nt: number of θ, the leading entries of p.
         """
         scores = self.unit * self.blocks(steps)
         blocks, rows = len(scores), self.share * float(self.segments.observations.sum())
-        grams = None if information is None else self._grams(steps, len(information))
-        if information is None or grams is None or len(grams) != blocks:
-            correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
-            return self.share * correction * scores.T @ scores, blocks
+        correction = blocks / max(blocks - 1, 1) * rows / max(rows - used, 1.0)
+        return self.share * correction * scores.T @ scores, blocks
+
+    def jackknife(
+        self, steps: int, used: float, information: Matrix, moves: Bool[np.ndarray, "n"], nt: int
+    ) -> tuple[Matrix, int]:
+        """Return `middle` by the scores `M (M − M_j)⁻¹ B_j` of fits without their block.
+
+        It is `middle` where the slopes do not fit into memory.
+
+        Args:
+            information: M of all of training, with the precisions of the prior, of the entries
+                of p that move.
+            moves: mask of these entries; a parameter at its bound is a constant to the others.
+            nt: number of θ among them, the leading ones.
+        """
+        scores, grams = self.unit * self.blocks(steps), self._grams(steps, len(moves))
+        blocks = len(scores)
+        if grams is None or len(grams) != blocks:
+            return self.middle(steps, used)
+        # In coordinates where M is the identity, (M − M_j)⁻¹ divides by 1 − the eigenvalues of M_j
         half = half_inverse(information, nt)
-        values, vectors = np.linalg.eigh(half.T @ grams @ half)
-        own = np.einsum("bri,br->bi", vectors, scores @ half) / np.maximum(1 - values, _LEFT)
-        without = np.einsum("bri,bi->br", vectors, own) @ (information @ half).T
-        return self.share * (blocks - 1) / blocks * without.T @ without, blocks
+        values, vectors = np.linalg.eigh(half.T @ grams[:, moves][:, :, moves] @ half)
+        own = np.einsum("bri,br->bi", vectors, scores[:, moves] @ half)
+        own /= np.maximum(1 - values, _LEFT)
+        scores[:, moves] = np.einsum("bri,bi->br", vectors, own) @ (information @ half).T
+        return self.share * (blocks - 1) / blocks * scores.T @ scores, blocks
 
     def _grams(self, steps: int, n: int) -> Float[np.ndarray, "b n n"] | None:
         """Return the information of each of `blocks`; None where it is too large for memory."""
@@ -260,7 +273,7 @@ class FreeRunScores:
         freedom: float,
         used: float,
         steps: int | None,
-        nt: int,
+        moving: Bool[np.ndarray, "np"],
         *,
         modelled: bool = False,
     ) -> Statistics:
@@ -272,7 +285,7 @@ class FreeRunScores:
             statistics, freedom: of errors that are white.
             used: parameters of the fit.
             steps: of a block.
-            nt: number of θ, the leading entries of p.
+            moving: mask of the θ that are not at a bound; they are the leading entries of p.
             modelled: take the errors for an autoregressive process instead of blocks.
 
         Raises:
@@ -289,5 +302,9 @@ class FreeRunScores:
                 "the errors of the free run are correlated over too many steps for blocks; use "
                 "a longer record."
             )
-        middle, blocks = self.middle(steps, used, statistics.information(nt), nt)
+        assert statistics.gram is not None
+        weights = np.ones(len(statistics.gram) - len(moving), dtype=bool)
+        moves, nt = np.concatenate([moving, weights]), int(moving.sum())
+        information = statistics.among(moves, len(moving)).information(nt)
+        middle, blocks = self.jackknife(steps, used, information, moves, nt)
         return replace(statistics, middle=middle, freedom=min(freedom, blocks - 1.0))

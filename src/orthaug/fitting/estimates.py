@@ -248,8 +248,8 @@ class Estimate(FitView):
         steps = None if lags is None else check_count(lags, "lags")
         used = len(self.theta) + self.effective_weights
         modelled = kind == "autoregressive"
-        nt = len(self.theta)
-        own = self.scores.robust(statistics, self.freedom, used, steps, nt, modelled=modelled)
+        moving = np.array([name not in self.at_bound for name in self.problem.names], dtype=bool)
+        own = self.scores.robust(statistics, self.freedom, used, steps, moving, modelled=modelled)
         return replace(self._with_statistics(own, kind), freedom=own.freedom)._renewed()
 
     def _check_not_withheld(self) -> None:

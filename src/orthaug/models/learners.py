@@ -191,8 +191,10 @@ class MLP:
             z = ACTIVATIONS[activation](weight @ z + bias)
         return z
 
-    def run(self, tree: Tree, z: Float[Array, "nz m"]) -> tuple[Float[Array, "ny m"], list[Any]]:
-        """Return values at m points, and what `pull` needs: each layer's inputs and slopes."""
+    def forward(
+        self, tree: Tree, z: Float[Array, "nz m"]
+    ) -> tuple[Float[Array, "ny m"], list[Any]]:
+        """Return values at m points, and what `backward` needs: each layer's inputs and slopes."""
         inside = []
         for weight, bias, activation in self.layers(tree):
             sums = _product_at_points(weight, z) + bias[:, None]
@@ -201,7 +203,7 @@ class MLP:
             z = value
         return z, inside
 
-    def pull(
+    def backward(
         self, tree: Tree, inside: list[Any], rows: Float[Array, "k ny m"]
     ) -> tuple[list[Array], Array]:
         """Return rows · ∂f/∂w as arrays (k, …, m) in the tree's order, and rows · ∂f/∂z."""
@@ -545,19 +547,19 @@ class Bound:
             return self.learner.apply_to_many(self.tree(leaves), z)  # type: ignore[attr-defined]
         return self.from_leaves(leaves, z)
 
-    def run(
+    def forward(
         self, w: Float[Array, "nw"] | list[Any], z: Float[Array, "nz m"]
     ) -> tuple[Float[Array, "ny m"], Any]:
-        """Return f at m points, and what `pull` needs for its derivatives there.
+        """Return f at m points, and what `backward` needs for its derivatives there.
 
         Points are the last axis: every entry is contiguous along them.
         """
         leaves = w if isinstance(w, list) else self.leaves(w)
         if self._is_plain_mlp:
-            return self.learner.run(self.tree(leaves), z)  # type: ignore[attr-defined]
+            return self.learner.forward(self.tree(leaves), z)  # type: ignore[attr-defined]
         return jax.vmap(lambda z: self.one_of_many(leaves, z), -1, -1)(z), z
 
-    def pull(
+    def backward(
         self, w: Float[Array, "nw"] | list[Any], kept: Any, rows: Float[Array, "k ny m"]
     ) -> tuple[list[Array], Float[Array, "k nz m"]]:
         """Return rows · ∂f/∂w, an array (k, …, m) for each of w, and rows · ∂f/∂z, at m points.
@@ -565,12 +567,11 @@ class Bound:
         It is one pass backwards for each row. A derivative that does not exist is 0.
 
         Args:
-            kept: as `run` returns it.
+            kept: as `forward` returns it.
         """
         leaves = w if isinstance(w, list) else self.leaves(w)
         if self._is_plain_mlp:
-            return self.learner.pull(self.tree(leaves), kept, rows)  # type: ignore[attr-defined]
-
+            return self.learner.backward(self.tree(leaves), kept, rows)  # type: ignore[attr-defined]
         if not self.differentiable:  # and without weights
             return [], jnp.zeros((len(rows), *kept.shape))
 
@@ -583,7 +584,7 @@ class Bound:
 
     @staticmethod
     def columns(leaves: Sequence[Array], rows: Float[Array, "k _ m"]) -> Float[Array, "k nw m"]:
-        """Return what `pull` returned of rows by the weights, side by side."""
+        """Return what `backward` returned of rows by the weights, side by side."""
         k, _, m = rows.shape
         none = jnp.zeros((k, 0, m))  # a learner may have no weights
         return jnp.concatenate([none, *(leaf.reshape(k, -1, m) for leaf in leaves)], axis=1)
@@ -605,9 +606,9 @@ class Bound:
         One pass backwards per output. The batch is the *last* axis: every entry of the Jacobian is
         then contiguous over rows, which is 2.5 times faster here than rows first.
         """
-        values, kept = self.run(w, z)
+        values, kept = self.forward(w, z)
         scaled: Any = sum(gain[:, i] * values[i] for i in range(self.ny))
-        to_leaves, _ = self.pull(w, kept, gain)
+        to_leaves, _ = self.backward(w, kept, gain)
         return scaled, jnp.moveaxis(self.columns(to_leaves, gain), 0, 1)
 
 

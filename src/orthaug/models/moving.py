@@ -54,7 +54,7 @@ class Slopes(NamedTuple):
 
 
 class FieldSlopes(NamedTuple):
-    """Value of F at m points, ∂F/∂x, ∂F/∂c, and what `Bound.pull` needs for ∂F/∂w."""
+    """Value of F at m points, ∂F/∂x, ∂F/∂c, and what `Bound.backward` needs for ∂F/∂w."""
 
     value: Any
     to_x: Any
@@ -128,7 +128,7 @@ def _through_learner(
     pulled: list[list[Array]] = []
     for i, own in enumerate(rows):
         at_stage = jax.tree.map(lambda part, i=i: part[i], kept)
-        pulled.append(form.bound.pull(numbers.weights, at_stage, own)[0])
+        pulled.append(form.bound.backward(numbers.weights, at_stage, own)[0])
     summed: list[Any] = [sum(parts) for parts in zip(*pulled, strict=True)]
     return form.bound.columns(summed, rows[0])
 
@@ -167,7 +167,7 @@ def field_slopes(
 def learner_slopes(
     form: MotionField, numbers: Numbers, x: Array, u: Array
 ) -> tuple[Any, Array, Array]:
-    """Return what `Bound.pull` needs, g and ∂g/∂x at m points.
+    """Return what `Bound.backward` needs, g and ∂g/∂x at m points.
 
     Learned equations come first, then learned outputs.
     """
@@ -177,10 +177,10 @@ def learner_slopes(
 
     z = jax.vmap(features, -1, -1)(x, u)
     z_to_x = _finite(jax.vmap(jax.jacfwd(features), -1, -1)(x, u))
-    value, kept = form.bound.run(numbers.weights, z)
+    value, kept = form.bound.forward(numbers.weights, z)
     ny, m = value.shape
     gain = jnp.broadcast_to(jnp.asarray(numbers.gain), (ny,))[:, None]
-    to_z = form.bound.pull(numbers.weights, kept, _identity(ny, m) * gain)[1]
+    to_z = form.bound.backward(numbers.weights, kept, _identity(ny, m) * gain)[1]
     return kept, gain * value, _finite(_product(to_z, z_to_x))
 
 
@@ -218,7 +218,7 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) 
         g, g_to_x = (part[len(states) :] for part in learned)
         one = _identity(len(outputs), x.shape[1])
         rows = _learner_rows(form, numbers, one, range(len(outputs)), len(states))
-        g_to_w = form.bound.columns(form.bound.pull(numbers.weights, kept, rows)[0], rows)
+        g_to_w = form.bound.columns(form.bound.backward(numbers.weights, kept, rows)[0], rows)
         own = ((value, g), (to_x, g_to_x), (to_w, g_to_w))
         value, to_x, to_w = (_add_to_rows(a, outputs, b) for a, b in own)
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
