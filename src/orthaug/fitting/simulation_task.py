@@ -194,13 +194,13 @@ class SimulationTask(ABC):
         free = plan.descend(objective, best.p, solver.within_limit, report, best.states, **kept)
         if not _lowers_loss(free, best.loss):
             return self._below_physics(free if first is None else first)
-        learned = first is not None and _lowers_loss(first, best.loss)
-        if first is not None and learned and not self._is_clearly_better(free, first):
-            return self._below_physics(first)
+        settled = first if first is not None and _lowers_loss(first, best.loss) else None
+        if settled is not None and not self._is_clearly_better(free, settled):
+            return self._below_physics(settled)
         point, options = free.end.point, options | {"evidence_settled": False}
         again = plan.descend(objective, point.p, solver, report, point.states, **kept, **options)
-        if first is not None and learned and not self._is_clearly_better(again, first):
-            return self._below_physics(first)
+        if settled is not None and not self._is_clearly_better(again, settled):
+            return self._below_physics(settled)
         chosen = again if _lowers_loss(again, best.loss) else free if first is None else first
         if chosen is not free:
             spent = {

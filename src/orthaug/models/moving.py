@@ -84,41 +84,66 @@ def sample_slopes(
     few = form.substeps <= (2 if learned else UNROLLED) and not (form.large and form.substeps > 1)
     over_substeps = _unrolled if few else jax.lax.scan
     small = form.states * form.unknowns <= _FUSED and not form.large
-    over_stages = _unrolled if small else jax.lax.scan
-
-    def substep(x: Array, u: tuple[Array, ...]) -> tuple[Any, FieldSlopes]:
-        def stage(rates: Array, given: tuple[Array, Array]) -> tuple[Any, FieldSlopes]:
-            ahead, u = given
-            slopes = field_slopes(form, numbers, x + ahead * h * rates, u)
-            return slopes.value, slopes
-
-        first, middle, last = u
-        given = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.stack([first, middle, middle, last])
-        stages = over_stages(stage, jnp.zeros_like(x), given)[1]
-        rates = stages.value
-        return x + h / 6 * (rates[0] + 2 * (rates[1] + rates[2]) + rates[3]), stages
-
-    def back(slopes: Slopes, stages: FieldSlopes) -> tuple[Slopes, None]:
-        def before(sums: tuple[Array, ...], given: tuple[Array, ...]) -> tuple[Any, Array]:
-            """Go to the stage before, with the slopes by F of the one behind it, by x and by c."""
-            (share, to_x, to_c), (own, through, next_to_x, stage_to_x, stage_to_c) = sums, given
-            share = h * (own * slopes.to_x + through * _product(share, next_to_x))
-            sums = share, to_x + _product(share, stage_to_x), to_c + _product(share, stage_to_c)
-            return sums, _learner_rows(form, numbers, share, learned, 0) if learned else share
-
-        weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6, jnp.array([0.5, 0.5, 1.0, 0.0])
-        given = (*weights, jnp.roll(stages.to_x, -1, axis=0), stages.to_x, stages.to_c)
-        begun = slopes.to_x, slopes.to_x, slopes.to_c
-        (_, to_x, to_c), rows = over_stages(before, begun, given, reverse=True)
-        to_w = slopes.to_w
-        if learned:
-            to_w = to_w + _through_learner(form, numbers, rows, stages.kept)
-        return Slopes(slopes.value, to_x, to_c, to_w), None
-
-    end, stages = over_substeps(substep, states, (points[:-2:2], points[1:-1:2], points[2::2]))
+    given = form, numbers, h, _unrolled if small else jax.lax.scan
+    end, stages = over_substeps(
+        partial(_substep, *given), states, (points[:-2:2], points[1:-1:2], points[2::2])
+    )
     n, m = states.shape
     nothing = (jnp.zeros((n, count, m)) for count in (len(numbers.c), form.bound.size))
-    return over_substeps(back, Slopes(end, _identity(n, m), *nothing), stages, reverse=True)[0]
+    slopes = Slopes(end, _identity(n, m), *nothing)
+    return over_substeps(partial(_back, *given), slopes, stages, reverse=True)[0]
+
+
+def _substep(
+    form: MotionField, numbers: Numbers, h: Array, over_stages: Any, x: Array, u: Any
+) -> tuple[Array, FieldSlopes]:
+    """Return x⁺ = x + h (F₁ + 2 F₂ + 2 F₃ + F₄)/6, and the four stages with their slopes.
+
+    F_s is F at x + a_s h F_{s−1}, a = (0, ½, ½, 1); `u` are inputs at begin, middle and end.
+    """
+
+    def stage(rates: Array, given: tuple[Array, Array]) -> tuple[Array, FieldSlopes]:
+        ahead, u = given
+        slopes = field_slopes(form, numbers, x + ahead * h * rates, u)
+        return slopes.value, slopes
+
+    first, middle, last = u
+    given = jnp.array([0.0, 0.5, 0.5, 1.0]), jnp.stack([first, middle, middle, last])
+    stages = over_stages(stage, jnp.zeros_like(x), given)[1]
+    rates = stages.value
+    return x + h / 6 * (rates[0] + 2 * (rates[1] + rates[2]) + rates[3]), stages
+
+
+def _back(
+    form: MotionField,
+    numbers: Numbers,
+    h: Array,
+    over_stages: Any,
+    after: Slopes,
+    stages: FieldSlopes,
+) -> tuple[Slopes, None]:
+    """Return the slopes of where the sample ends, from those by x⁺ to those by x.
+
+    With A = ∂x_end/∂x⁺ and b = (1, 2, 2, 1)/6 the adjoints are
+    ψ_s = ∂x_end/∂F_s = h (b_s A + a_{s+1} ψ_{s+1} ∂F_{s+1}/∂x). Then ∂x_end/∂x = A + Σ ψ_s ∂F_s/∂x,
+    and the slopes by c and w grow by Σ ψ_s ∂F_s/∂c and Σ ψ_s ∂F_s/∂w.
+    """
+    learned = form.corrected[0]
+
+    def before(sums: tuple[Array, ...], given: tuple[Array, ...]) -> tuple[Any, Array]:
+        (adjoint, to_x, to_c), (own, ahead, next_to_x, stage_to_x, stage_to_c) = sums, given
+        adjoint = h * (own * after.to_x + ahead * _product(adjoint, next_to_x))
+        sums = adjoint, to_x + _product(adjoint, stage_to_x), to_c + _product(adjoint, stage_to_c)
+        return sums, _learner_rows(form, numbers, adjoint, learned, 0) if learned else adjoint
+
+    weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6, jnp.array([0.5, 0.5, 1.0, 0.0])
+    given = (*weights, jnp.roll(stages.to_x, -1, axis=0), stages.to_x, stages.to_c)
+    begun = after.to_x, after.to_x, after.to_c
+    (_, to_x, to_c), rows = over_stages(before, begun, given, reverse=True)
+    to_w = after.to_w
+    if learned:
+        to_w = to_w + _through_learner(form, numbers, rows, stages.kept)
+    return Slopes(after.value, to_x, to_c, to_w), None
 
 
 def _through_learner(
