@@ -247,13 +247,14 @@ FLIGHT = {
 }
 
 
-def flown_lagged(record, engine=None):
-    """A free run with evidence over segments that are too short for the colour of its noise."""
+def flown_lagged(record, engine=None, **options):
+    """A free run over segments that are too short for the colour of its noise."""
     criterion = oa.Simulation(40, 20, start_iterations=0)
-    return oa.estimate(record, BASELINE, **(OPTIONS | FLIGHT), criterion=criterion, engine=engine)
+    given = OPTIONS | FLIGHT | options
+    return oa.estimate(record, BASELINE, **given, criterion=criterion, engine=engine)
 
 
-def flown_motion(record, engine=None):
+def flown_motion(record, engine=None, **options):
     """A motion in discrete time, whose segments show that colour themselves."""
     states = [oa.State("x", "a*x + b*z + c*u", start="y", learned=True), oa.State("z", "x")]
     values = [
@@ -265,9 +266,8 @@ def flown_motion(record, engine=None):
         states, [oa.Output("y", "x")], values, ["u"], integrator="discrete"
     )
     learner, criterion = oa.MLP((2,)), oa.Simulation(60, 0)
-    return oa.estimate(
-        record, motion, learner=learner, **FLIGHT, criterion=criterion, engine=engine
-    )
+    given = FLIGHT | options
+    return oa.estimate(record, motion, learner=learner, **given, criterion=criterion, engine=engine)
 
 
 def told_of(fit):
@@ -296,6 +296,22 @@ def opened(folder):
     return oa.open_parquet(
         sorted((folder / "runs").glob("*.parquet")), partition_rows=200, **COLUMNS
     )
+
+
+def test_segments_of_files_give_the_free_run_of_rows_in_memory_to_rounding(folder):
+    """With a fixed ridge and few steps: rounding has not grown yet."""
+    record = from_files(folder)
+    ridge = {"regularization": 0.01, "solver": oa.LevenbergMarquardt(5)}
+    pairs = (
+        (flown_lagged(opened(folder), **ridge), flown_lagged(record, **ridge)),
+        (flown_motion(record, Stream(), **ridge), flown_motion(record, **ridge)),
+    )
+    for streamed, whole in pairs:
+        np.testing.assert_allclose(streamed.theta, whole.theta, rtol=1e-10)
+        weights = [fit.model.numbers.weights for fit in (streamed, whole)]
+        np.testing.assert_allclose(*weights, rtol=1e-8)
+        assert streamed.status.loss == pytest.approx(whole.status.loss, rel=1e-10)
+        assert streamed.status.iterations == whole.status.iterations
 
 
 def test_segments_of_files_give_the_free_run_of_rows_in_memory(folder, in_memory):
