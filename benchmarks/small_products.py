@@ -18,7 +18,7 @@ from machine import describe
 import orthaug as oa
 from orthaug._base.jax import jax
 from orthaug.fitting.segments import Segments, respond, sensitivity
-from orthaug.models.learners import MLP
+from orthaug.models.learners import ACTIVATIONS, MLP
 
 STEPS, RUNS = 600, 15
 LANES, HIDDEN = (1, 4, 16), ((8,), (32,), (16, 16))
@@ -28,7 +28,9 @@ class _ByMatrices(MLP):
     """The same learner by matrix products."""
 
     def apply(self, tree: Any, z: Any) -> Any:
-        return self.apply_to_many(tree, z)
+        for weight, bias, activation in self.layers(tree):
+            z = ACTIVATIONS[activation](weight @ z + bias)
+        return z
 
 
 def fit(hidden: tuple[int, ...]) -> Any:

@@ -185,12 +185,6 @@ class MLP:
             z = ACTIVATIONS[activation](_few_rows_product(weight, z) + bias)
         return z
 
-    def apply_to_many(self, tree: Tree, z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """Return `apply` for one of the thousands of rows that are mapped, by matrix products."""
-        for weight, bias, activation in self.layers(tree):
-            z = ACTIVATIONS[activation](weight @ z + bias)
-        return z
-
     def forward(
         self, tree: Tree, z: Float[Array, "nz m"]
     ) -> tuple[Float[Array, "ny m"], list[Any]]:
@@ -219,7 +213,7 @@ class MLP:
 
 def _product_at_points(weight: Array, z: Float[Array, "nz m"]) -> Any:
     """Return `weight @ z`, as sums along the points where there are few of both."""
-    if weight.size > _SMALL_PRODUCT or z.shape[1] > _MANY_POINTS:
+    if not 0 < weight.size <= _SMALL_PRODUCT or z.shape[1] > _MANY_POINTS:
         return weight @ z
     return sum(weight[:, i, None] * z[None, i] for i in range(len(z)))
 
@@ -541,12 +535,6 @@ class Bound:
         """Return f(z; w) for one row, of the weight arrays."""
         return self.learner.apply(self.tree(leaves), z)
 
-    def one_of_many(self, leaves: Sequence[Array], z: Float[Array, "nz"]) -> Float[Array, "ny"]:
-        """Return `from_leaves` where thousands of rows are mapped side by side."""
-        if self._is_plain_mlp:
-            return self.learner.apply_to_many(self.tree(leaves), z)  # type: ignore[attr-defined]
-        return self.from_leaves(leaves, z)
-
     def forward(
         self, w: Float[Array, "nw"] | list[Any], z: Float[Array, "nz m"]
     ) -> tuple[Float[Array, "ny m"], Any]:
@@ -557,7 +545,7 @@ class Bound:
         leaves = w if isinstance(w, list) else self.leaves(w)
         if self._is_plain_mlp:
             return self.learner.forward(self.tree(leaves), z)  # type: ignore[attr-defined]
-        return jax.vmap(lambda z: self.one_of_many(leaves, z), -1, -1)(z), z
+        return jax.vmap(lambda z: self.from_leaves(leaves, z), -1, -1)(z), z
 
     def backward(
         self, w: Float[Array, "nw"] | list[Any], kept: Any, rows: Float[Array, "k ny m"]
@@ -576,7 +564,7 @@ class Bound:
             return [], jnp.zeros((len(rows), *kept.shape))
 
         def at_one_point(z: Array, rows: Array) -> Any:
-            back = jax.vjp(self.one_of_many, leaves, z)[1]
+            back = jax.vjp(self.from_leaves, leaves, z)[1]
             return jax.tree.map(lambda *parts: jnp.stack(parts), *map(back, rows))
 
         pulled = jax.vmap(at_one_point, -1, -1)(kept, rows)

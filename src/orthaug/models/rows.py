@@ -450,9 +450,7 @@ def row_values(
     bound: Bound, w: Float[Array, "nw"], z: Float[Array, "k nz m"]
 ) -> Float[Array, "k ny m"]:
     """Return f at every row, in the learner's unit."""
-    leaves = bound.leaves(w)
-    one_chunk = jax.vmap(lambda row: bound.one_of_many(leaves, row), in_axes=-1, out_axes=-1)
-    return jax.lax.map(one_chunk, z)
+    return jax.lax.map(lambda chunk: bound.forward(w, chunk)[0], z)
 
 
 def _values(bound: Bound, chunk: Chunk, w: Array, tilt: Array | None) -> Float[Array, "ny m"]:
@@ -462,9 +460,7 @@ def _values(bound: Bound, chunk: Chunk, w: Array, tilt: Array | None) -> Float[A
     """
 
     def member_values(w: Array) -> Array:
-        leaves = bound.leaves(w)
-        values = jax.vmap(lambda z: bound.one_of_many(leaves, z), in_axes=-1, out_axes=-1)(chunk.z)
-        return chunk.learned(values)
+        return chunk.learned(bound.forward(w, chunk.z)[0])
 
     if tilt is None:
         return member_values(w)
