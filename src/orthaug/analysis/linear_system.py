@@ -124,7 +124,9 @@ class System:
         found = self.response(np.array([rest + 0j]))
         matrix = rest * np.eye(self.states) - self.a
         inside = np.abs(np.linalg.solve(matrix, self.b))
-        error = np.abs(np.linalg.inv(matrix)) @ (np.abs(matrix) @ inside)  # Skeel 1979
+        # Both terms of each entry are rounded, though they may cancel (Skeel 1979).
+        terms = rest * np.eye(self.states) + np.abs(self.a)
+        error = np.abs(np.linalg.inv(matrix)) @ (terms @ inside)
         least = _NOTHING * (np.abs(self.c) @ error + np.abs(self.d))
         value, moved = (
             None if part is None else np.where(np.abs(part.real) < least, 0.0, part.real)
