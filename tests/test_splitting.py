@@ -233,6 +233,8 @@ def test_a_measure_beyond_the_data_is_warned_of(curve, coarser):
         "only 29 % of the uniform measure lies within reach of the training data" in str(w)
         for w in found.warnings
     )
+    again = found.split(Training())
+    assert [w for w in again.warnings if w.code == "measure_beyond_data"] == []
 
 
 # --- the paper's data sets

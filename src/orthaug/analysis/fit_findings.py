@@ -34,7 +34,6 @@ from orthaug.physics.parameters import PhysicalParameter
 if TYPE_CHECKING:
     from orthaug.analysis.budget import ParameterBias
     from orthaug.inference.physical import PhysicalEstimate
-    from orthaug.inference.splitting import MotionSplit
 
 
 class StatusResult(Content):
@@ -109,12 +108,6 @@ class MeasureResult(Content):
     support: Number
     condition: Number
     std_over_training: Numbers | None = Field(validation_alias="price")
-
-    @classmethod
-    def of_motion(cls, split: MotionSplit) -> MeasureResult:
-        """Return the measure of a motion, which has neither a condition of Φ nor a price."""
-        own = {"name": split.name, "points": len(split.field.x), "support": split.support}
-        return cls.model_validate({**own, "condition": None, "price": None})
 
 
 class OutputWeightsResult(Content):

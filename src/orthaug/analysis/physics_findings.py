@@ -16,7 +16,7 @@ from orthaug.analysis.bias import ResidualStep, bias_table
 from orthaug.analysis.budget import budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
-from orthaug.analysis.fit_findings import MeasureResult, physical_rows
+from orthaug.analysis.fit_findings import physical_rows
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
@@ -256,7 +256,7 @@ def _of_motion(
         parts = attempt(
             "the size of the learned part", lambda: equation_parts(fit, x, u), warnings, None
         )
-        found["measure_detail"] = MeasureResult.of_motion(fit.split_by)
+        found["measure_detail"] = fit.split_by
     # what is not identified has other solutions anyway
     if fit.alone is not None and not fit.model.coloured and not fit.unidentified:
         alone, solver = fit.alone, LevenbergMarquardt().within_limit

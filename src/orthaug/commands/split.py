@@ -14,7 +14,7 @@ from orthaug._base.checks import check_choice
 from orthaug._base.errors import InputError, KeyedError, Warning
 from orthaug._base.folders import file_digest
 from orthaug._base.registry import Key, keys_of, resolve
-from orthaug.analysis.fit_findings import MeasureResult, parameter_rows
+from orthaug.analysis.fit_findings import parameter_rows
 from orthaug.commands.folder import results_beside
 from orthaug.commands.run import (
     ModelOnData,
@@ -198,8 +198,11 @@ def _split_lagged(
             "bound, or with `fixed = true` there."
         )
     support = Support(model.fitting(record, need_outputs=True), model.form.layout, model.form.used)
-    under = split_by_measure(measure, model, support, model.statistics.joint(len(model.theta)))
-    std = None if under.covariance is None else np.sqrt(np.diag(under.covariance))
+    under, joint = (
+        split_by_measure(measure, model, support),
+        model.statistics.joint(len(parameters)),
+    )
+    std = None if joint is None or under.slope is None else np.sqrt(np.diag(joint.of(under.slope)))
     ci = None if std is None else interval(under.theta, std, model.statistics.freedom)
     return SplitResult.model_validate(
         {
@@ -226,7 +229,7 @@ def _split_motion(
             "parameters": parameter_rows(parameters, values, fit.std, fit.interval),
             "theta_aux": np.asarray(fit.model.numbers.theta_aux),
             "measure": split.name,
-            "measure_detail": MeasureResult.of_motion(split),
+            "measure_detail": split,
             "orthogonality_defect": split.defect,
             "warnings": [*warnings, *fit.warnings, *([_UNKNOWN] if lacking else [])],
         }

@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector, check_choice, check_count
 from orthaug._base.errors import InputError, Warning
@@ -34,9 +35,10 @@ from orthaug.inference.over_experiments import (
     over_experiments,
     split_without_each,
 )
+from orthaug.inference.splitting import MeasureSplit
 from orthaug.models.model import Model
 from orthaug.models.response import Response
-from orthaug.models.statistics import Statistics, half_inverse
+from orthaug.models.statistics import JointCovariance, Statistics, half_inverse
 from orthaug.physics.excitation import Excitation
 from orthaug.physics.parameters import Coordinates
 from orthaug.physics.projection import Projection
@@ -73,6 +75,7 @@ _FOR_THE_LIBRARY = {
         "lines",
         "moved_by",
         "moves_by",
+        "theta_slope",
         "plain_statistics",
         "reach",
         "robust_kinds",
@@ -127,6 +130,8 @@ class Estimate(FitView):
     None without one.
     """
     problem: Any = field(repr=False)
+    split_by: MeasureSplit | None = field(default=None, repr=False)
+    """θ under the measure that it was split under; None of lagged physics split over their rows."""
     criterion: Criterion = Prediction()  # noqa: RUF009  (frozen)
     at_bound: Mapping[str, float] = field(default_factory=dict)
     """Parameters at a bound, with its value."""
@@ -147,6 +152,9 @@ class Estimate(FitView):
     """The model's statistics for white noise, where they are robust; None where they are not."""
     setup: TrainingSetup | None = field(default=None, repr=False)
     """Its problem as it was given and the options of training; None of a model that was split."""
+
+    _of_split: ClassVar[tuple[str, ...]] = ("measure_beyond_data",)
+    """Codes of warnings that another split makes anew."""
 
     def __dir__(self) -> list[str]:
         """Return the public names, which completion lists."""
@@ -283,7 +291,58 @@ class Estimate(FitView):
 
     def _renewed(self: Fit) -> Fit:
         """Return the fit with the covariance of θ̂ that follows from the model's statistics."""
-        raise NotImplementedError
+        return replace(self, covariance=self._covariance_by(self.model.statistics))
+
+    def _with_split(self: Fit, split: MeasureSplit, warnings: Sequence[Warning] = ()) -> Fit:
+        """Return the fit with θ, standard errors and warnings of a split."""
+        numbers = self.model.numbers._replace(theta=split.theta, theta_aux=split.theta_aux)
+        kept = (w for w in self.warnings if w.code not in self._of_split)
+        made = replace(
+            self,
+            model=replace(self.model, numbers=numbers, measure=split.name),
+            split_by=split,
+            defect=split.defect,
+            warnings=(*kept, *split.warnings, *warnings),
+        )
+        covariance, plain = made._covariance_by(self.model.statistics), self.plain_covariance
+        if plain is not None:
+            plain = made._covariance_by(self._white_statistics)
+        if self.std_kind in WITHHELD:
+            covariance = None
+        return replace(made, covariance=covariance, plain_covariance=plain)
+
+    def _covariance_by(self, statistics: Statistics) -> Matrix | None:
+        """Return Cov θ̂ = K Cov(c, w) Kᵀ by statistics of (c, w)."""
+        made = self.free_covariance(statistics)
+        slope = None if made is None else self.theta_slope
+        if made is None or slope is None:
+            return None
+        joint, moves = made
+        return joint.of(slope[:, moves])
+
+    def free_covariance(
+        self, statistics: Statistics | None = None
+    ) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
+        """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
+
+        None without statistics, by default the model's.
+        """
+        statistics = self.model.statistics if statistics is None else statistics
+        if statistics.gram is None:
+            return None
+        count = len(self.theta)
+        moves = self._moving(len(statistics.gram))
+        joint = statistics.among(moves, count).joint(int(moves[:count].sum()))
+        return None if joint is None else (joint, moves)
+
+    def _moving(self, count: int) -> Bool[np.ndarray, "n"]:
+        """Return a mask of those of the `count` entries of (c, w) that are unknowns."""
+        return np.ones(count, dtype=bool)
+
+    @property
+    def theta_slope(self) -> Matrix | None:
+        """∂θ/∂(c, w) (nθ, nθ + nw) under the measure; None where that is not known."""
+        return None if self.split_by is None else self.split_by.slope
 
     @property
     def theta(self) -> Vector:
@@ -446,9 +505,11 @@ class Estimate(FitView):
         )
         return replace(found, interval=self._ends(found.interval))
 
-    def moves_by(self) -> tuple[Matrix, Vector] | None:
+    def moves_by(self) -> tuple[Matrix, Bool[np.ndarray, "n"]] | None:
         """Return ∂θ/∂(c, w), and which entries of (c, w) move; None where that is not known."""
-        raise NotImplementedError
+        made = self.free_covariance()
+        slope = None if made is None else self.theta_slope
+        return None if made is None or slope is None else (slope, made[1])
 
     def withheld(self: Fit, kind: str, why: Warning) -> Fit:
         """Return the fit without standard errors and intervals of θ, terms and predictions.

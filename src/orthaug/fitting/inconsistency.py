@@ -234,7 +234,7 @@ def _rows(fit: LaggedEstimate, one_step: Response) -> _Rows | None:
     prior = prior_of(plain.gram, plain.ridge, len(fit.theta))
     if not np.isfinite(slopes).all() or not np.isfinite(errors).all():
         return None
-    influence = Influence.of(slopes, plain, fit.moves_by()[0], len(fit.theta))
+    influence = Influence.of(slopes, plain, fit.theta_slope, len(fit.theta))
     weights = np.concatenate([np.zeros(len(fit.theta)), np.asarray(model.numbers.weights).ravel()])
     if len(weights) != len(prior):
         weights = np.zeros(len(prior))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from orthaug._base.checks import Matrix, Vector, check_choice, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.views import MAKERS
 from orthaug.data.record import Record
-from orthaug.fitting.estimates import ROBUST_FREE_RUN, WITHHELD, Estimate, left_out
+from orthaug.fitting.estimates import ROBUST_FREE_RUN, Estimate, left_out
 from orthaug.inference.covariance import (
     joint_covariance,
     robust_covariance,
@@ -56,8 +57,13 @@ class LaggedEstimate(Estimate):
 
     model: Model[LaggedDynamics]
     problem: Problem = field(repr=False)
-    measure: MeasureSplit | None = None
-    """What θ was split under, if not the training measure."""
+
+    _of_split: ClassVar[tuple[str, ...]] = (*Estimate._of_split, NOT_UNIQUE)
+
+    @property
+    def measure(self) -> MeasureSplit | None:
+        """What θ was split under, if not the training measure."""
+        return self.split_by
 
     @property
     def robust_kinds(self) -> tuple[str, ...]:
@@ -108,44 +114,31 @@ class LaggedEstimate(Estimate):
         support = Support(
             self.problem.record, self.problem.layout, self.model.form.used, self.problem.rows.x
         )
-        joint = self.model.statistics.joint(len(self.theta))
-        under = split_by_measure(measure, self.model, support, joint)
-        if under.covariance is not None:
-            white = self.measure is None and self.plain_covariance is None
-            training = self.covariance if white else None
-            training = (
-                split_by_measure(Training(), self.model, support, joint).covariance
-                if training is None
-                else training
-            )
-            with np.errstate(all="ignore"):
-                price = np.sqrt(np.diag(under.covariance) / np.diag(np.asarray(training)))
-            under = replace(under, price=price)
-        plain = None
-        if self.plain_statistics is not None and under.slope is not None:
-            plain = self._cov_along(self.plain_statistics, under.slope)
-        ensemble = under.covariance is None and self.model.numbers.tilt is not None
+        under = split_by_measure(measure, self.model, support)
+        price = self._price(under, support)
         text = "no standard errors after a split: an ensemble has no gradient in its weights."
+        ensemble = under.slope is None and self.model.numbers.tilt is not None
         unknown = (Warning("no_standard_errors", text),) if ensemble else ()
-        numbers = self.model.numbers._replace(theta=under.theta, theta_aux=under.theta_aux)
-        made = replace(
-            self,
-            model=replace(
-                self.model, numbers=numbers, structure="orthogonal", measure=measure.name
-            ),
-            covariance=None if self.std_kind in WITHHELD else under.covariance,
-            plain_covariance=plain,
-            std_kind=self.std_kind if plain is not None or self.std_kind in WITHHELD else "plain",
-            defect=under.defect,
-            measure=under,
-            warnings=(
-                *(w for w in self.warnings if w.code != NOT_UNIQUE),
-                *under.warnings,
-                *unknown,
-            ),
-        )
-        coloured = self.std_kind == "newey-west" and made.covariance is not None
-        return MAKERS["intervals"](made) if coloured else made
+        coloured, plain = self.std_kind == "newey-west", self
+        if coloured:  # whose lags depend on the rows' influence, and are found anew
+            plain = replace(self, plain_covariance=None, std_kind="plain")
+        made = plain._with_split(replace(under, price=price), unknown)
+        made = replace(made, model=replace(made.model, structure="orthogonal"))
+        return MAKERS["intervals"](made) if coloured and made.covariance is not None else made
+
+    def _price(self, under: MeasureSplit, support: Support) -> Vector | None:
+        """Return the standard errors of a split over those under the training measure."""
+        joint = self.model.statistics.joint(len(self.theta))
+        if joint is None or under.slope is None:
+            return None
+        white = self.split_by is None and self.plain_covariance is None
+        training = self.covariance if white else None
+        if training is None:
+            slope = split_by_measure(Training(), self.model, support).slope
+            assert slope is not None, "one split has a slope as the other"
+            training = joint.of(slope)
+        with np.errstate(all="ignore"):
+            return np.sqrt(np.diag(joint.of(under.slope)) / np.diag(training))
 
     def joint_covariance(self, convention: str = "calibrated") -> Matrix:
         """Return Cov (nθ + nw)² of θ̂ and the weights from the raw `[Φ P⊥J]`.
@@ -187,8 +180,8 @@ class LaggedEstimate(Estimate):
         if self.measure is None and self.model.shared is None:
             covariance = robust_covariance(*used)
         else:
-            k = self.moves_by()[0]
-            covariance = robust_split_covariance(self.problem, self.model, k, *used[1:])
+            slope = self.theta_slope
+            covariance = robust_split_covariance(self.problem, self.model, slope, *used[1:])
         covariance = self._enlarge(covariance, self.model.statistics)
         plain = self._white_covariance
         return replace(self, covariance=covariance, plain_covariance=plain, std_kind=kind)
@@ -212,7 +205,7 @@ class LaggedEstimate(Estimate):
         own = hc3(
             statistics, slopes, residual @ self.problem.weight.matrix.T, len(self.theta), share
         )
-        covariance = self._enlarge(self._cov_along(own, self.moves_by()[0]), own)
+        covariance = self._enlarge(super()._covariance_by(own), own)
         return replace(self._with_statistics(own, "hc3"), covariance=covariance)
 
     def _enlarge(self, covariance: Matrix | None, statistics: Statistics) -> Matrix | None:
@@ -221,24 +214,19 @@ class LaggedEstimate(Estimate):
             covariance, statistics, None if self.model.shared is None else self.problem.shared
         )
 
-    def _renewed(self) -> LaggedEstimate:
-        own = self.model.statistics
-        covariance = self._cov_along(own, self.moves_by()[0])
-        if self.measure is None:  # as of the errors without this
-            covariance = self._enlarge(covariance, own)
-        return replace(self, covariance=covariance)
+    def _covariance_by(self, statistics: Statistics) -> Matrix | None:
+        if self.model.numbers.tilt is not None:  # an ensemble has no gradient in its weights
+            return None
+        covariance = super()._covariance_by(statistics)
+        return self._enlarge(covariance, statistics) if self.split_by is None else covariance
 
-    def _cov_along(self, statistics: Statistics, k: Matrix) -> Matrix | None:
-        """Return Cov θ from statistics of (c, w) and ∂θ/∂(c, w)."""
-        joint = statistics.joint(len(self.theta))
-        return None if joint is None else joint.of(k)
-
-    def moves_by(self) -> tuple[Matrix, Vector]:
-        """Return [I, ∂θ_aux/∂w], by which θ follows (c, w), and which entries of these move."""
-        k = None if self.measure is None else self.measure.slope
-        if k is None:
-            k = np.column_stack([np.eye(len(self.theta)), self._learner_slope()])
-        return k, np.ones(k.shape[1], dtype=bool)
+    @property
+    def theta_slope(self) -> Matrix:
+        """[I, ∂θ_aux/∂w], by which θ follows (c, w) under the measure."""
+        known = super().theta_slope
+        if known is not None:
+            return known
+        return np.column_stack([np.eye(len(self.theta)), self._learner_slope()])
 
     def _learner_slope(self) -> Matrix:
         """Return ∂θ_aux/∂w under the training measure."""
@@ -264,7 +252,7 @@ class LaggedEstimate(Estimate):
             return None
         errors = self.model.predict(problem.record).errors
         matrix = problem.weight.matrix
-        influence = row_influence(problem, self.model, self.moves_by()[0])
+        influence = row_influence(problem, self.model, self.theta_slope)
         rows = np.einsum("kto,ko->kt", influence, errors @ (matrix.T @ matrix))
         found = np.stack([rows[owner == e].sum(axis=0) for e in range(experiments)])
         return -found * left_out(experiments)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import Warning
-from orthaug.fitting.estimates import WITHHELD, Estimate
+from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.field_points import field_under, wobble
-from orthaug.inference.measures import OF_ROWS, Measure, Training
+from orthaug.inference.measures import Measure, Training
 from orthaug.inference.nearly_shared import enlarge_covariance
 from orthaug.inference.splitting import (
     MotionSplit,
@@ -41,13 +41,6 @@ _VAGUE = 1.0  # standard error of a logarithm above which only the order of magn
 # times wider an interval without the prior of the weights: the prior is 3/4 of the information
 _LEANING = 2.0
 _ROUNDING = 1e-11  # of the largest eigenvalue of the information with unit columns
-_OF_SPLIT = (
-    "ill_conditioned",
-    "not_unique",
-    "at_a_bound",
-    "not_identified",
-    "measure_beyond_data",
-)  # codes of warnings that another split makes anew
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -66,6 +59,14 @@ class MotionEstimate(Estimate):
     """The coordinates of physics alone, where the nearest physics is searched from."""
     unidentified: tuple[str, ...] = ()
     """Parameters that no output determines beside the learner, or only the prior of its weights."""
+
+    _of_split: ClassVar[tuple[str, ...]] = (
+        *Estimate._of_split,
+        "ill_conditioned",
+        "not_unique",
+        "at_a_bound",
+        "not_identified",
+    )
 
     @property
     def excitation(self) -> Excitation:
@@ -106,7 +107,7 @@ class MotionEstimate(Estimate):
         """Return the same motion with p̂ under a measure, and its `statistics` or p̂ alone."""
         form, segmented = self.model.form, self.segmented
         whole = self.model.numbers.unsplit
-        field, support, of_measure = field_under(measure, segmented, whole, self.states)
+        field, support, warnings = field_under(measure, segmented, whole, self.states)
         moving = None
         if isinstance(measure, Training) and self.slope is not None and statistics:
             moving = partial(
@@ -120,47 +121,23 @@ class MotionEstimate(Estimate):
             )
         bounds = self.problem.motion.coordinates.bounds
         options = {"everything": shared == "all", "wobble": moving, "statistics": statistics}
-        split = split_motion(measure.name, form, whole, self.alone, field, bounds, **options)
-        split = replace(split, support=support, of_rows=isinstance(measure, OF_ROWS))
-        return self._with_split(split, of_measure)
+        split = split_motion(measure, form, whole, self.alone, field, bounds, **options)
+        return self._with_split(replace(split, support=support, warnings=warnings))
 
     def _renewed(self) -> MotionEstimate:
-        kept = tuple(w for w in self.warnings if w.code == "measure_beyond_data")
-        return self._with_split(self.split_by, kept)
+        return self._with_split(self.split_by)
 
-    def _with_split(
-        self, split: MotionSplit, of_measure: tuple[Warning, ...] = ()
-    ) -> MotionEstimate:
+    def _with_split(self, split: MotionSplit, warnings: Sequence[Warning] = ()) -> MotionEstimate:
         """Return the estimate with p̂, intervals and warnings of a split."""
-        coordinates, numbers = self.coordinates, self.model.numbers
-        held = ~coordinates.inside(split.q) & ~np.isnan(split.q)
-        values = zip(self.problem.motion.names, coordinates.physical(split.q), held, strict=True)
+        q, names = split.theta, self.problem.names
+        held = ~self.coordinates.inside(q) & ~np.isnan(q)
+        values = zip(names, self.coordinates.physical(q), held, strict=True)
         at_bound = {name: float(value) for name, value, there in values if there}
-        covariance, unseen = self._covariance_of(self.model.statistics, split, at_bound)
-        plain = self.plain_covariance
-        if plain is not None and self.plain_statistics is not None:
-            plain = self._covariance_of(self.plain_statistics, split, at_bound)[0]
-        warnings = [
-            *of_measure,
-            *self._ill_conditioned(split.q),
-            *_doubts(split, at_bound, unseen, self.learns),
-        ]
-        model = replace(
-            self.model,
-            numbers=numbers._replace(theta=split.q, theta_aux=split.q - np.asarray(numbers.c)),
-            measure=split.name,
-        )
-        return replace(
-            self,
-            model=model,
-            covariance=None if self.std_kind in WITHHELD else covariance,
-            plain_covariance=plain,
-            defect=split.defect,
-            split_by=split,
-            at_bound=at_bound,
-            unidentified=unseen,
-            warnings=(*(w for w in self.warnings if w.code not in _OF_SPLIT), *warnings),
-        )
+        made = replace(self, split_by=split, at_bound=at_bound)
+        unseen = made._unidentified_by(self.model.statistics)
+        doubts = [*self._ill_conditioned(q), *_doubts(split, at_bound, unseen, self.learns)]
+        made = super(MotionEstimate, made)._with_split(split, (*doubts, *warnings))
+        return replace(made, unidentified=unseen)
 
     def _ill_conditioned(self, q: Vector) -> list[Warning]:
         statistics, count = self.model.statistics, len(q)
@@ -169,48 +146,31 @@ class MotionEstimate(Estimate):
         gram = statistics.gram[:count, :count]
         return ill_conditioned.of_motion(self.problem, gram, q, statistics.noise)
 
-    def _covariance_of(
-        self, statistics: Statistics, split: MotionSplit, at_bound: Collection[str]
-    ) -> tuple[Matrix | None, tuple[str, ...]]:
-        """Return Cov q̂ = K Cov(c, w) Kᵀ, and the parameters that lack an interval.
-
-        No output determines these, or only the prior of the weights does.
-        """
-        names, made = self.problem.motion.names, self.free_covariance(statistics)
-        if split.slope is None or made is None:
-            return None, ()
-        joint, moves = made
-        slope = split.slope[:, moves]
-        covariance = joint.of(slope)
-        std, wider = np.sqrt(np.diag(covariance)), _wider_without_prior(joint, slope)
-        vague = self.coordinates.positive & (std > _VAGUE / wider)
-        unseen = tuple(
-            name for name, hidden in zip(names, vague | (wider > _LEANING), strict=True) if hidden
-        )
-        for i, name in enumerate(names):
-            if name in unseen or name in at_bound:
-                covariance[i] = covariance[:, i] = np.nan
-        return enlarge_covariance(covariance, statistics, split.shared), unseen
-
-    def free_covariance(
-        self, statistics: Statistics | None = None
-    ) -> tuple[JointCovariance, Bool[np.ndarray, "n"]] | None:
-        """Return Cov (c, w) of the entries that are not at a bound, and a mask of these.
-
-        None without statistics, by default the model's.
-        """
-        statistics = self.model.statistics if statistics is None else statistics
-        if statistics.gram is None:
+    def _covariance_by(self, statistics: Statistics) -> Matrix | None:
+        """Return Cov q̂, with NaN for the parameters that lack an interval."""
+        covariance = super()._covariance_by(statistics)
+        if covariance is None:
             return None
-        inside = self.coordinates.inside(np.asarray(self.model.numbers.c))
-        moves = np.concatenate([inside, np.ones(len(statistics.gram) - len(inside), dtype=bool)])
-        joint = statistics.among(moves, len(inside)).joint(int(inside.sum()))
-        return None if joint is None else (joint, moves)
+        lacking = {*self.at_bound, *self._unidentified_by(statistics)}
+        places = [i for i, name in enumerate(self.problem.names) if name in lacking]
+        covariance[places] = covariance[:, places] = np.nan
+        return enlarge_covariance(covariance, statistics, self.shared)
 
-    def moves_by(self) -> tuple[Matrix, Vector] | None:
-        """Return ∂q̂/∂(c, w), and which entries of (c, w) move; None without statistics."""
-        made, k = self.free_covariance(), self.split_by.slope
-        return None if made is None or k is None else (k, made[1])
+    def _unidentified_by(self, statistics: Statistics) -> tuple[str, ...]:
+        """Return the parameters that no output determines, or only the prior of the weights."""
+        made, slope = self.free_covariance(statistics), self.split_by.slope
+        if made is None or slope is None:
+            return ()
+        joint, moves = made
+        std = np.sqrt(np.diag(joint.of(slope[:, moves])))
+        wider = _wider_without_prior(joint, slope[:, moves])
+        vague = self.coordinates.positive & (std > _VAGUE / wider)
+        found = zip(self.problem.names, vague | (wider > _LEANING), strict=True)
+        return tuple(name for name, hidden in found if hidden)
+
+    def _moving(self, count: int) -> Bool[np.ndarray, "n"]:
+        inside = self.coordinates.inside(np.asarray(self.model.numbers.c))
+        return np.concatenate([inside, np.ones(count - len(inside), dtype=bool)])
 
     def moved_by(self, step: Vector) -> Vector:
         """Return by how much p̂ (np,) moves with a step of (c, w): the learner's split counts."""

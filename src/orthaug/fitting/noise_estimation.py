@@ -438,7 +438,7 @@ def _with_information(fit: LaggedEstimate) -> LaggedEstimate:
     noise = replace(model.noise, covariance=joint.of(each))
     covariance = fit.covariance
     if covariance is not None:
-        k = np.column_stack([fit.moves_by()[0], _split_slope(fit)])
+        k = np.column_stack([fit.theta_slope, _split_slope(fit)])
         held = np.flatnonzero(free[:nt] == 0)
         covariance = joint.of(k)
         covariance[held] = covariance[:, held] = np.nan

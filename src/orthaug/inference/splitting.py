@@ -19,7 +19,7 @@ is positive definite.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -30,14 +30,13 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
 from orthaug.data.sources import Partition
-from orthaug.inference.measures import Measure, Points, Support, weigh
+from orthaug.inference.measures import OF_ROWS, Measure, Points, Support, weigh
 from orthaug.models.dynamics import Numbers
 from orthaug.models.learners import Bound
 from orthaug.models.model import Model
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.rows import InMemory, Overlaps, chunk_shape, learner_rows
-from orthaug.models.statistics import JointCovariance
 from orthaug.models.streaming import chunks_of, sum_rows
 from orthaug.physics.excitation import require_rank
 from orthaug.physics.left_over import UnexplainedPhysics, left_over
@@ -59,11 +58,13 @@ _FEWEST = 4  # moves that succeed, for each parameter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Split:
-    """θ of a fitted function under a measure: what is said of it for any physics."""
+class MeasureSplit:
+    """θ and θ_aux under a measure, and the share of it that the data support, for any physics."""
 
     name: str
     """Name of the measure."""
+    theta: Vector
+    theta_aux: Vector
     defect: float | None
     """‖projection of the rest on the shared directions‖ / ‖learner‖ over the measure; None without
     a learner.
@@ -72,25 +73,19 @@ class Split:
     """Share of the measure within reach of the training data."""
     slope: Matrix | None = None
     """∂θ/∂(c, w) (nθ, nθ + nw); None where it is not known, or where θ is not unique."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MeasureSplit(Split):
-    """θ, θ_aux and Cov θ under a measure, and the share of it that the data support.
-
-    Cov θ is None without statistics.
-    """
-
-    theta: Vector
-    theta_aux: Vector
-    covariance: Matrix | None
     points: int
-    condition: float | None
-    warnings: tuple[Warning, ...]
+    condition: float | None = None
+    """Condition of Φ over the measure; None of a motion."""
+    warnings: tuple[Warning, ...] = ()
     price: Vector | None = None
     """Standard error of each θ over that under the training measure (nθ,)."""
     measure: Measure | None = None
     """What it was split under."""
+
+    @property
+    def of_rows(self) -> bool:
+        """True if its points are those of the training rows."""
+        return isinstance(self.measure, OF_ROWS)
 
     def __str__(self) -> str:
         text = (
@@ -105,15 +100,12 @@ class MeasureSplit(Split):
         )
 
 
-def split_by_measure(
-    measure: Measure, model: Model, support: Support, joint: JointCovariance | None
-) -> MeasureSplit:
+def split_by_measure(measure: Measure, model: Model, support: Support) -> MeasureSplit:
     """Split a model under a measure.
 
     Args:
         model: any, however it was trained. Its c = θ − θ_aux and its prediction stay what they are.
         support: the training data.
-        joint: Cov(c, w) from training; None for no intervals.
 
     Raises:
         InputError: a measure that does not fit the model, or under which the physics is
@@ -136,28 +128,24 @@ def split_by_measure(
     values = weighed.times(raw)
     aux = projection.solve_along(values, model.shared)
     theta = model.theta - model.theta_aux + aux
-    covariance = slope = None
-    if joint is not None and numbers.tilt is None:
+    slope = None
+    if numbers.tilt is None and model.statistics.joint(len(theta)) is not None:
         own = learner_slope(model, points, projection, unit, weighed.noise)
         slope = np.column_stack([np.eye(len(theta)), own])
-        covariance = joint.of(slope)
     size = np.linalg.norm(values)
     rest = values - projection.phi @ aux
     left = projection.along(model.shared) @ projection.coordinates(rest)
     defect = float(np.linalg.norm(left) / size) if 0 < size < np.inf else None
     share = support.share(points)
-    warnings = beyond_data(measure, share) if form.learns else ()
-    condition = weighed.excitation.condition
     return MeasureSplit(
         name=measure.name,
         theta=theta,
         theta_aux=aux,
-        covariance=covariance,
         defect=defect,
         support=share,
         points=len(points.x),
-        condition=condition,
-        warnings=warnings,
+        condition=weighed.excitation.condition,
+        warnings=beyond_data(measure, share) if form.learns else (),
         slope=slope,
         measure=measure,
     )
@@ -244,10 +232,9 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MotionSplit(Split):
-    """q̂ (np,) of p̂, its shared directions, and the points that it was split over."""
+class MotionSplit(MeasureSplit):
+    """q̂ (np,) of p̂ as its θ, its shared directions, and the points that it was split over."""
 
-    q: Vector
     shared: SharedDirections
     share: float | None = None
     """‖learner‖ / ‖field‖ of the learned equations over the measure, after the split."""
@@ -256,8 +243,6 @@ class MotionSplit(Split):
     zero.
     """
     field: Field
-    of_rows: bool = False
-    """True if the points are those of the training rows."""
 
     @classmethod
     def empty(cls, name: str, form: MotionField, c: Vector) -> MotionSplit:
@@ -269,7 +254,8 @@ class MotionSplit(Split):
             np.zeros(0),
         )
         shared = SharedDirections(form.motion.names, np.zeros((len(c), 0)))
-        return cls(name=name, q=c, shared=shared, defect=None, field=nothing)
+        own = {"theta": c, "theta_aux": np.zeros(len(c)), "defect": None}
+        return cls(name=name, shared=shared, points=0, field=nothing, **own)
 
 
 def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> SharedDirections:
@@ -402,7 +388,7 @@ def _unit(basis: Matrix, gauss: Matrix) -> Matrix:
 
 
 def split_motion(
-    name: str,
+    measure: Measure,
     form: MotionDynamics,
     numbers: Numbers,
     start: Vector,
@@ -416,7 +402,7 @@ def split_motion(
     """Return p̂ of a fitted motion under a measure.
 
     Args:
-        name: of the measure.
+        field: the points of the measure.
         start: coordinates of physics alone.
         everything: whether all directions count as shared (the paper's projection).
         wobble: (np, np + nw) from (q̂): `Σ φ_qx dx/d(c, w)` of points that are the fitted run's;
@@ -426,13 +412,23 @@ def split_motion(
     count = len(form.motion.parameters)
     basis = np.eye(count) if everything else None
     c = np.asarray(numbers.c)
+    q, shared = c, SharedDirections(form.motion.names, np.zeros((count, 0)))
+    if form.learns:
+        q, shared = nearest(form, numbers, start, field, bounds, basis)
+    split = MotionSplit(
+        name=measure.name,
+        theta=q,
+        theta_aux=q - c,
+        defect=None,
+        points=len(field.x),
+        measure=measure,
+        shared=shared,
+        field=field,
+    )
     if not form.learns:
-        nothing = SharedDirections(form.motion.names, np.zeros((count, 0)))
-        own = {"name": name, "field": field, "slope": np.eye(count)}
-        return MotionSplit(q=c, shared=nothing, defect=None, **own)
-    q, shared = nearest(form, numbers, start, field, bounds, basis)
+        return replace(split, slope=np.eye(count))
     if not statistics:
-        return MotionSplit(name=name, q=q, shared=shared, field=field, slope=None, defect=None)
+        return split
     whole = np.concatenate([np.eye(count), np.zeros((count, form.bound.size))], axis=1)
     second, to_c, to_w, gauss, gradient, learner, rest, size = (
         np.asarray(part) for part in _sum_over(_second, form, numbers, q, field)
@@ -440,8 +436,7 @@ def split_motion(
     with np.errstate(all="ignore"):
         share = float(np.sqrt(rest / size)) if size > 0 else None
     if not shared.basis.size:
-        own = {"name": name, "field": field, "slope": whole}
-        return MotionSplit(q=q, shared=shared, defect=None, share=share, **own)
+        return replace(split, slope=whole, share=share)
     b = _unit(shared.basis, gauss)
     inner, flat, left = b.T @ second @ b, b.T @ gauss @ b, b.T @ gradient
     along = float(left @ np.linalg.lstsq(flat, left, rcond=None)[0])
@@ -454,16 +449,7 @@ def split_motion(
             0.0 if wobble is None else wobble(q)
         )
         slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
-    return MotionSplit(
-        name=name,
-        q=q,
-        shared=shared,
-        slope=slope,
-        defect=defect,
-        share=share,
-        curvature=curvature,
-        field=field,
-    )
+    return replace(split, slope=slope, defect=defect, share=share, curvature=curvature)
 
 
 def _learned_rows(form: MotionDynamics, q: AnyArray, x: Array, u: Array) -> Array:
