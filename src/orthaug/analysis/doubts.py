@@ -339,9 +339,8 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
 def _structure_test(fit: Any) -> StructureTest | None:
     """Return the test of a fit's free run over its training data, or the segments of these."""
     from orthaug.analysis.hidden_state import structure_test  # slow to import
-    from orthaug.analysis.trained_start import judged_record
 
-    record = judged_record(fit)
+    record = fit.judged_record
     return structure_test(fit.model, record, by_experiment=record is fit.problem.record)
 
 

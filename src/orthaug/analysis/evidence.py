@@ -31,9 +31,8 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.models.learners import Learner, declared
 from orthaug.models.rows import InMemory
 from orthaug.models.tasks import runs_on
-from orthaug.physics.motion import Motion
-from orthaug.physics.parameters import PhysicsMap, check_time_units
-from orthaug.physics.problem import MotionProblem, PosedProblem, Problem
+from orthaug.physics.parameters import PhysicsMap
+from orthaug.physics.problem import PosedProblem, Problem
 
 if TYPE_CHECKING:
     from orthaug._base.parallel import Threads
@@ -145,7 +144,7 @@ class Evidence:
         if not isinstance(self.problem, Problem):
             if noise_of_motion(self.noise) == "innovations":
                 return "noise"
-            return "loop" if self.problem.motion.held else "motion"
+            return "loop" if self.problem.set_by_controller else "motion"
         if self.noise != "white":
             return "noise"
         return "direct" if (criterion or self.criterion).free_run is None else "free run"
@@ -157,14 +156,9 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
     Of physics that is linear in θ they say what a fit without them gives. Inputs that nothing of
     the model reads are said, too.
     """
-    found = _unread(problem)
-    if isinstance(problem, Problem):
-        return [*found, *data_warnings(problem.record, partial(fit_without, problem))]
-    set_by_controller: Sequence[str] = ()
-    if isinstance(problem, MotionProblem):
-        found += _other_times(problem.motion, problem.record.time_column)
-        set_by_controller = problem.motion.held
-    return [*found, *data_warnings(problem.record, limited=set_by_controller)]
+    effect = partial(fit_without, problem) if isinstance(problem, Problem) else None
+    wild = data_warnings(problem.record, effect, limited=problem.set_by_controller)
+    return [*_unread(problem), *_other_times(problem), *wild]
 
 
 def _unread(problem: PosedProblem) -> list[Warning]:
@@ -180,9 +174,9 @@ def _unread(problem: PosedProblem) -> list[Warning]:
     return [Warning("unread_input", text)]
 
 
-def _other_times(motion: Motion, column: str | None) -> list[Warning]:
+def _other_times(problem: PosedProblem) -> list[Warning]:
     """Return a warning on parameters whose units have another time than the equations."""
-    names = check_time_units(motion, column)
+    names, column = problem.other_time_units, problem.record.time_column
     if not names:
         return []
     text = (

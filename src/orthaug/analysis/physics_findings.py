@@ -26,7 +26,6 @@ from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.analysis.other_solutions import find_other_solution
-from orthaug.analysis.trained_start import judged_record
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
@@ -235,7 +234,7 @@ def _of_motion(
     free_run: Response,
     warnings: list[Warning],
 ) -> dict[str, Any]:
-    record, judged = fit.problem.record, judged_record(fit)
+    record, judged = fit.problem.record, fit.judged_record
     x, u = np.split(fit.reach(judged), [fit.model.form.states], axis=1)
     bounded = record if judged is record else None  # no run of an unstable plant is bounded
     found: dict[str, Any] = {

@@ -163,33 +163,6 @@ def _unstable(segment: int, step: float) -> Warning:
     return Warning("unstable_plant", text)
 
 
-def judged_record(fit: Estimate) -> Record:
-    """Return the training data in experiments over which a free run is judged.
-
-    Those of an unstable plant are its segments.
-    """
-    begins = _begins(fit) if isinstance(fit, MotionEstimate) else None
-    record = fit.problem.record
-    if begins is None:
-        return record
-    pieces = [
-        experiment.rows(first, last)
-        for experiment, own in zip(record.experiments, begins, strict=True)
-        for first, last in pairwise([*own, len(experiment)])
-    ]
-    return replace(record, experiments=tuple(pieces))
-
-
-def _begins(fit: MotionEstimate) -> list[list[int]] | None:
-    """Return the first rows of the segments of an unstable plant; None of a stable one."""
-    segmented = fit.segmented
-    values = np.asarray(fit.problem.values_at(np.asarray(fit.theta)), dtype=float)
-    whole = all(len(own) == 1 for own in segmented.begins)
-    if whole or fit.model.coloured or not fit.problem.steps_to_leave(values):
-        return None
-    return segmented.begins
-
-
 @singledispatch
 def _trained_run(fit: Estimate, free_run: Response) -> TrainedRun | None:
     """Return the run of a kind of physics; None where there is none."""
@@ -214,7 +187,7 @@ def _from_trained_state(fit: MotionEstimate, free_run: Response) -> TrainedRun |
     numbers = model.numbers
     rows = fit.segmented.states_by_row(np.asarray(numbers.c), numbers.weights, fit.states)
     trajectories, states = [], []
-    begins = _begins(fit)
+    begins = fit.restarts_at
     each = [[0]] * len(rows) if begins is None else begins
     for experiment, own, first in zip(record.experiments, rows, each, strict=True):
         inputs = np.asarray(model.form.inputs(experiment, record))

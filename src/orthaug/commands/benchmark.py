@@ -151,8 +151,7 @@ def _model(
             _scored(result, part.name, len(job.train.record.outputs)),
         )
     ]
-    motion = job.spec.motion is not None
-    named = result.parameters if motion else result.physical_parameters
+    named = result.physical_parameters if job.problem.linear else result.parameters
     return BenchmarkModelResult(
         model=name,
         fit=kind,

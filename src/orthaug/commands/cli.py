@@ -121,7 +121,7 @@ def fit(
     asked = arguments("fit", spec, out=out, resume=resume, json=as_json, force=force)
     job = replace(keep_states(job, folder, resume=resume), arguments=asked)
     learns, rows = job.spec.declared_learner() is not None, job.problem.count
-    takes_a_while = learns or job.spec.motion is not None
+    takes_a_while = learns or not job.problem.linear
 
     def keep_finished(finished: FitReport) -> None:
         WATCH.rescue = partial(write_result, finished, folder, force=force)

@@ -143,23 +143,20 @@ def spec_text(
         document.add(tomlkit.comment("Inputs and outputs are guessed by what predicts what."))
     document.add("data", _data(found, roles, out, rows, cut, gaps, named))
     document.add(tomlkit.nl())
+    learner = tomlkit.table()
+    learner.add("kind", "mlp")
+    learner.add("hidden", [8])
     if motion is None:
         linear = "linear difference equations, to be replaced by what you know"
         document.add(tomlkit.comment(f"The physics: {linear} ([motion]: equations of motion)."))
         document.add("baseline", _baseline(named, model))
         sees = "the lags that the physics reads; [lags] gives it more, learner.inputs fewer"
+        learner["hidden"].comment(f"sees {sees}")
     else:
         document.add(tomlkit.comment("The physics: equations of motion, for you to change."))
         document.add("motion", motion_section(motion))
-        sees = ", ".join(motion.inputs if motion.learned[0] else motion.names_of_states)
-    if motion is None or motion.learned[0] or motion.learned[1]:
-        learner = tomlkit.table()
-        learner.add("kind", "mlp")
-        learner.add("hidden", [8])
-        if motion is None:
-            learner["hidden"].comment(f"sees {sees}")
-        else:
-            learner.add("inputs", sees.split(", "))
+        learner.add("inputs", list(motion.inputs if motion.learned[0] else motion.names_of_states))
+    if motion is None or any(motion.learned):
         document.add("learner", learner)
     training = tomlkit.table()
     training.add("restarts", 3)

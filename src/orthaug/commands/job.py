@@ -112,6 +112,10 @@ class JobPhysics(ABC, Generic[P, F]):
     def rows_needed(self, spec: Spec) -> tuple[int, int]:
         """Return the rows before the first one with a prediction, and the fewest of a stretch."""
 
+    def runs_through_gaps(self, spec: Spec) -> bool:
+        """Return whether a fit of the spec can run through missing outputs."""
+        return False
+
     @abstractmethod
     def pose(self, spec: Spec, record: Record) -> P:
         """Return the problem on a record in memory."""

@@ -208,6 +208,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         """
         return 0, len(self.motion.states) + 1
 
+    def runs_through_gaps(self, spec: Spec) -> bool:
+        return spec.noise.model == "white"
+
     def pose(self, spec: Spec, record: Record, **options: Any) -> MotionProblem:
         learner, weights = spec.declared_learner(), spec.training.output_weights
         inputs = spec.learner_inputs() if learner is not None else None

@@ -58,7 +58,7 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
     train, validation, tests = parts or load_parts(path, spec)
     with _named(path):
         first, least = physics.rows_needed(spec)
-        keeps = spec.motion is not None and spec.noise.model == "white"
+        keeps = physics.runs_through_gaps(spec)
         train = train.without_short(first, least, keeps=keeps)
         validation = validation and validation.without_short(first, least, keeps=keeps)
         tests = tuple(part.without_short(first, least, keeps=keeps) for part in tests)

@@ -289,7 +289,7 @@ def write_back(model: Model, folder: Path, to: str, *, force: bool = False) -> N
     """
     motion: Any = getattr(model.form, "motion", None)
     source: Any = getattr(motion, "source", None)
-    if motion is None or not isinstance(source, FileSource) or source.target != to:
+    if not isinstance(source, FileSource) or source.target != to:
         own = f"; its own is {source.target}" if isinstance(source, FileSource) else ""
         raise InputError(f"the physics do not come from a file that {to} writes{own}.")
     values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()

@@ -71,6 +71,7 @@ _FOR_THE_LIBRARY = {
         "alone",
         "coordinates",
         "free_covariance",
+        "judged_record",
         "layout",
         "lines",
         "moved_by",
@@ -185,6 +186,14 @@ class Estimate(FitView):
             InputError: other channels, too few rows, or initial values that are not there.
         """
         return self.model.simulate(record, initial)
+
+    @property
+    def judged_record(self) -> Record:
+        """The training data in experiments over which a free run is judged.
+
+        Those of an unstable plant are its segments.
+        """
+        return self.problem.record
 
     @property
     def excitation(self) -> Excitation:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import Warning
+from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.field_points import field_under, wobble
 from orthaug.inference.measures import Measure, Training
@@ -76,6 +78,28 @@ class MotionEstimate(Estimate):
         if gram is None:
             return Excitation(0, count, None, ())
         return of_gram(gram[:count, :count], names)
+
+    @property
+    def restarts_at(self) -> list[list[int]] | None:
+        """First rows of the segments of an unstable plant, by experiment; None of a stable one."""
+        begins = self.segmented.begins
+        values = np.asarray(self.problem.values_at(np.asarray(self.theta)), dtype=float)
+        whole = all(len(own) == 1 for own in begins)
+        if whole or self.model.coloured or not self.problem.steps_to_leave(values):
+            return None
+        return begins
+
+    @property
+    def judged_record(self) -> Record:
+        record, begins = self.problem.record, self.restarts_at
+        if begins is None:
+            return record
+        pieces = [
+            experiment.rows(first, last)
+            for experiment, own in zip(record.experiments, begins, strict=True)
+            for first, last in pairwise([*own, len(experiment)])
+        ]
+        return replace(record, experiments=tuple(pieces))
 
     @property
     def shared(self) -> SharedDirections:

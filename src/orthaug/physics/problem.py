@@ -92,6 +92,16 @@ class PosedProblem:
         return ()
 
     @property
+    def set_by_controller(self) -> tuple[str, ...]:
+        """Names of the signals that a declared controller sets."""
+        return ()
+
+    @property
+    def other_time_units(self) -> tuple[str, ...]:
+        """Parameters in equations whose units have another time than the instants."""
+        return ()
+
+    @property
     def derived_units(self) -> dict[str, str]:
         """Units of parameters that follow from those of the channels."""
         return {}
@@ -512,6 +522,14 @@ class MotionProblem(GuessedMotion, PosedProblem):
     @property
     def physics_in_words(self) -> str:
         return f"motion of {', '.join(self.motion.names_of_states)}"
+
+    @property
+    def set_by_controller(self) -> tuple[str, ...]:
+        return self.motion.held
+
+    @property
+    def other_time_units(self) -> tuple[str, ...]:
+        return check_time_units(self.motion, self.record.time_column)
 
     def values_at(self, theta: Vector) -> Vector:
         return self.motion.coordinates.physical(theta)
