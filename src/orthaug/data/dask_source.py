@@ -11,7 +11,7 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug.data.channels import Channel, as_channels, check_channels
 from orthaug.data.record import Experiment, check_step
-from orthaug.data.sources import join_pieces, stretches
+from orthaug.data.sources import join_pieces, read_pieces
 
 _NAME = "the DataFrame"
 _HISTORY = 10_000  # rows of the partition before that are kept beside each: no lag is larger
@@ -93,27 +93,18 @@ class FramePartitionData:
             if stop <= known or first >= stop:
                 continue
             label = "" if own.experiment is None else f", experiment {labels[start]:g}"
-            yield from self._piece(values[first:stop], own.first_row - known + first, label, lead)
-
-    def _piece(self, values: np.ndarray, row: int, label: str, lead: int) -> Iterator[Experiment]:
-        outputs, inputs = self.of.channels
-        signals = [
-            values[:, part] * [c.scale for c in group] + [c.offset for c in group]
-            for part, group in ((slice(len(outputs)), outputs), (slice(len(outputs), None), inputs))
-        ]
-        experiment = Experiment(
-            signals[1], signals[0], f"{_NAME}{label}", first_row=row, offset=row
-        )
-        if self.of.missing == "skip":
-            yield from stretches(experiment, lead)
-            return
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            where = f"row {row + bad[0][0]}, column '{self.of.columns[bad[0][1]]}'"
-            raise InputError(
-                f"{self.name}: {where}: found {values[tuple(bad[0])]}; expected a finite number."
+            row = own.first_row - known + first
+            yield from read_pieces(
+                values[first:stop],
+                own.channels,
+                lead,
+                missing=own.missing,
+                columns=own.columns,
+                name=self.name,
+                source=f"{_NAME}{label}",
+                first_row=row,
+                offset=row,
             )
-        yield experiment
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from orthaug.data.channels import Channel, as_channels, check_channels
 from orthaug.data.clock import DRIFT, JITTER
 from orthaug.data.headers import in_seconds
 from orthaug.data.record import Experiment, check_step, same_step
-from orthaug.data.sources import join_pieces, stretches
+from orthaug.data.sources import join_pieces, read_pieces
 from orthaug.data.tables import check_present, check_readable, parquet_file
 
 BATCH_ROWS = 32_768  # rows that are built at once: several such blocks are in memory
@@ -102,44 +102,20 @@ class RowGroups:
             for (a, b), began in zip(runs.ranges, runs.began, strict=True):
                 first = max(a, position, start)
                 if first < min(b, end):
-                    yield from self._piece(
-                        buffer, begin, (max(a, first - lead), min(b, end)), began, a, lead
+                    row = max(a, first - lead)
+                    yield from read_pieces(
+                        buffer[row - begin : min(b, end) - begin],
+                        (self.reading.outputs, self.reading.inputs),
+                        lead,
+                        missing=self.reading.missing,
+                        columns=self.reading.columns,
+                        name=self.path,
+                        source=self.path,
+                        first_row=row,
+                        start_time=began,
+                        offset=row - a,
                     )
             held = buffer[max(len(buffer) - lead, 0) :]
-
-    def _piece(
-        self,
-        buffer: np.ndarray,
-        begin: int,
-        rows: tuple[int, int],
-        began: float,
-        first: int,
-        lead: int,
-    ) -> Iterator[Experiment]:
-        """Return rows of a buffer that begins at row `begin` of the file.
-
-        Their experiment begins at `first`.
-        """
-        reading, ny = self.reading, len(self.reading.outputs)
-        values = buffer[rows[0] - begin : rows[1] - begin]
-        place: dict[str, Any] = {"source": self.path, "first_row": rows[0], "start_time": began}
-        place["offset"] = rows[0] - first
-        signals = [
-            values[:, part] * [c.scale for c in group] + [c.offset for c in group]
-            for part, group in ((slice(ny), reading.outputs), (slice(ny, None), reading.inputs))
-        ]
-        experiment = Experiment(signals[1], signals[0], **place)
-        if reading.missing == "skip":
-            yield from stretches(experiment, lead)
-            return
-        bad = np.argwhere(~np.isfinite(values))
-        if len(bad):
-            row, column = bad[0]
-            value = values[row, column]
-            found = "the cell is empty" if np.isnan(value) else f"found '{value}'"
-            where = f"row {rows[0] + row}, column '{reading.columns[column]}'"
-            raise InputError(f"{self.path}: {where}: {found}; expected a finite number.")
-        yield experiment
 
     def check_unchanged(self) -> None:
         """Raise InputError where the file is not the one that was opened."""

@@ -13,6 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from orthaug._base.errors import InputError
 from orthaug.data.channels import Channel
 from orthaug.data.record import Experiment, Record, unbroken
 
@@ -248,6 +249,49 @@ def stretches(experiment: Experiment, lead: int) -> Iterator[Experiment]:
             yield experiment
         elif end - begin > lead:
             yield _slice_experiment(experiment, begin, end)
+
+
+def read_pieces(
+    values: np.ndarray,
+    channels: tuple[Sequence[Channel], Sequence[Channel]],
+    lead: int,
+    *,
+    missing: str,
+    columns: Sequence[str],
+    name: object,
+    **place: Any,
+) -> Iterator[Experiment]:
+    """Yield the pieces of rows that were read, in the units of their channels.
+
+    Args:
+        values: the rows, whose columns are those of the outputs, then of the inputs.
+        channels: outputs and inputs.
+        lead: rows of history before the first one.
+        missing: "skip" to cut at missing samples; else they are refused.
+        columns: names in the file.
+        name: of the source, for messages.
+        place: fields of an `Experiment` that say where the rows are.
+
+    Raises:
+        InputError: a missing sample that is not skipped.
+    """
+    count = len(channels[0])
+    outputs, inputs = (
+        values[:, part] * [c.scale for c in group] + [c.offset for c in group]
+        for part, group in zip((slice(count), slice(count, None)), channels, strict=True)
+    )
+    experiment = Experiment(inputs, outputs, **place)
+    if missing == "skip":
+        yield from stretches(experiment, lead)
+        return
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        row, column = bad[0]
+        value = values[row, column]
+        found = "the cell is empty" if np.isnan(value) else f"found '{value}'"
+        where = f"row {experiment.first_row + row}, column '{columns[column]}'"
+        raise InputError(f"{name}: {where}: {found}; expected a finite number.")
+    yield experiment
 
 
 def follows(one: Any, other: Any) -> bool:

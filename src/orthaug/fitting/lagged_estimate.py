@@ -135,7 +135,7 @@ class LaggedEstimate(Estimate):
         training = self.covariance if white else None
         if training is None:
             slope = split_by_measure(Training(), self.model, support).slope
-            assert slope is not None, "one split has a slope as the other"
+            assert slope is not None  # as of the other split
             training = joint.of(slope)
         with np.errstate(all="ignore"):
             return np.sqrt(np.diag(joint.of(under.slope)) / np.diag(training))

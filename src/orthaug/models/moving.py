@@ -172,15 +172,8 @@ def field_slopes(
     form: MotionField, numbers: Numbers, x: Float[Array, "nx m"], u: Float[Array, "nu m"]
 ) -> FieldSlopes:
     """Return F and its slopes at m points."""
-    coordinates, states = form.motion.coordinates, form.corrected[0]
-
-    def physics(x: Array, u: Array) -> tuple[Any, Any, Any]:
-        def rates(x: Array, c: Array) -> Array:
-            return form.motion.rates(x, u, coordinates.physical(c, jnp), jnp)
-
-        return _differentiate(rates, x, numbers.c, form.motion)
-
-    value, to_x, to_c = jax.vmap(physics, -1, -1)(x, u)
+    states = form.corrected[0]
+    value, to_x, to_c = _physics_slopes(form, form.motion.rates, numbers.c, x, u)
     to_x, to_c = _finite(to_x), _finite(to_c)
     if not states:
         return FieldSlopes(value, to_x, to_c, ())
@@ -227,16 +220,9 @@ def _learner_rows(
 
 def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) -> Slopes:
     """Return y and its slopes at m points, of states and inputs."""
-    coordinates, (states, outputs) = form.motion.coordinates, form.corrected
+    states, outputs = form.corrected
     u: Any = jax.vmap(form.now, -1, -1)(inputs)
-
-    def physics(x: Array, u: Array) -> tuple[Any, Any, Any]:
-        def observed(x: Array, c: Array) -> Array:
-            return form.motion.observed(x, u, coordinates.physical(c, jnp), jnp)
-
-        return _differentiate(observed, x, numbers.c, form.motion)
-
-    value, to_x, to_c = jax.vmap(physics, -1, -1)(x, u)
+    value, to_x, to_c = _physics_slopes(form, form.motion.observed, numbers.c, x, u)
     to_w = jnp.zeros((len(value), form.unknowns - len(numbers.c), x.shape[1]))
     if outputs:
         kept, *learned = learner_slopes(form, numbers, x, u)
@@ -247,6 +233,20 @@ def output_slopes(form: MotionField, numbers: Numbers, x: Array, inputs: Array) 
         own = ((value, g), (to_x, g_to_x), (to_w, g_to_w))
         value, to_x, to_w = (_add_to_rows(a, outputs, b) for a, b in own)
     return Slopes(value, _finite(to_x), _finite(to_c), to_w)
+
+
+def _physics_slopes(
+    form: MotionField, equations: Any, c: Any, x: Array, u: Array
+) -> tuple[Any, Any, Any]:
+    """Return the motion's rates or outputs at m points, and their slopes by x and c."""
+
+    def at(x: Array, u: Array) -> tuple[Any, Any, Any]:
+        def values(x: Array, c: Array) -> Array:
+            return equations(x, u, form.motion.coordinates.physical(c, jnp), jnp)
+
+        return _differentiate(values, x, c, form.motion)
+
+    return jax.vmap(at, -1, -1)(x, u)
 
 
 def _identity(n: int, m: int) -> Array:

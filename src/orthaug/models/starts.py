@@ -24,7 +24,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_rows
-from orthaug.models.dynamics import Numbers, Parts, in_batches, last_outputs
+from orthaug.models.dynamics import Dynamics, Numbers, Parts, in_batches, last_outputs
 from orthaug.models.filters import LaggedFilter, MotionFilter
 from orthaug.models.kalman import Filter
 from orthaug.models.lagged import LaggedDynamics
@@ -223,25 +223,10 @@ class PastOutputs:
             return Predicted(first, form.parts_at(model.numbers, x), None, last)
         inputs = form.inputs(experiment, record)
         windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)  # (m, nu, T)
-        rows = form.first_row + np.arange(len(windows))
-
-        arrays: tuple[np.ndarray, ...] = (form.start(experiment.outputs, rows), windows)
-        arrays = arrays if expected is None else (*arrays, expected)
-
-        def ahead(states: Matrix, windows: np.ndarray, added: np.ndarray | None = None) -> Parts:
-            """Return the last of the steps from each of the states; the windows overlap."""
-            found = last_outputs(
-                form,
-                model.numbers,
-                states.T,
-                np.moveaxis(windows, (0, 2), (2, 0)),
-                horizon,
-                None if added is None else np.moveaxis(added, 0, -1),
-            )
-            return Parts(*(np.asarray(part).T for part in found))
-
-        largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
-        return Predicted(first, in_batches(ahead, arrays, largest), None, last)
+        states = form.start(experiment.outputs, form.first_row + np.arange(len(windows)))
+        added = () if expected is None else (expected,)
+        parts = _last_of(form, model.numbers, states, windows, *added)
+        return Predicted(first, parts, None, last)
 
     @staticmethod
     def _forecast(
@@ -391,7 +376,7 @@ class EstimatedStates:
             states = corrected.run(own, start, rows).states[window : len(rows) - horizon + 1]
             plain, inputs = corrected.plain, corrected.plain.inputs(experiment, record)[window:]
             windows = np.lib.stride_tricks.sliding_window_view(inputs, horizon, axis=0)
-            outputs.append(_last_of(plain, own, states, windows))
+            outputs.append(_last_of(plain, own, states, windows).total)
         nothing = np.zeros_like(outputs[0])
         return Predicted(window + horizon - 1, Parts(outputs[0], nothing, nothing), outputs[-1])
 
@@ -483,17 +468,30 @@ def _settle_from_either(
 
 
 def _last_of(
-    form: MotionDynamics, numbers: Numbers, states: Matrix, windows: Float[np.ndarray, "m nu T"]
-) -> Matrix:
-    """Return the outputs (m, ny) at the ends of runs from states (m, nx) along windows."""
+    form: Dynamics,
+    numbers: Numbers,
+    states: Matrix,
+    windows: Float[np.ndarray, "m nu T"],
+    *expected: Float[np.ndarray, "m T ny"],
+) -> Parts:
+    """Return the outputs (m, ny) at the ends of runs from states (m, n0) along windows.
 
-    def ahead(states: Matrix, windows: np.ndarray) -> Parts:
-        inputs, steps = np.moveaxis(windows, (0, 2), (2, 0)), windows.shape[2]
-        found = last_outputs(form, numbers, states.T, inputs, steps)
+    The errors `expected` on the way are added to the outputs.
+    """
+
+    def ahead(states: Matrix, windows: np.ndarray, added: np.ndarray | None = None) -> Parts:
+        found = last_outputs(
+            form,
+            numbers,
+            states.T,
+            np.moveaxis(windows, (0, 2), (2, 0)),
+            windows.shape[2],
+            None if added is None else np.moveaxis(added, 0, -1),
+        )
         return Parts(*(np.asarray(part).T for part in found))
 
     largest = max(1, _WINDOW_CELLS // max(1, windows[0].size))
-    return in_batches(ahead, (states, windows), largest).total
+    return in_batches(ahead, (states, windows, *expected), largest)
 
 
 def _pad(rows: Matrix, size: int) -> Float[np.ndarray, "T n 1"]:

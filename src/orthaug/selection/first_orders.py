@@ -161,19 +161,17 @@ def _coupled(
         return (), chosen
     if len(record) > FEW_ROWS:
         record = witness(RecordSource(record, 0), FEW_ROWS)
-    nk, tried = chosen[1].nk, []
+    nk = chosen[1].nk
+    tried: list[_Choice] = []
     for na, n in product(range(1, MOST_LAGS + 1), range(1, MOST_LAGS + 1)):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
         errors = _errors_together(record, orders, every, length)
         if errors is not None:
-            tried.append((float(np.mean(errors)), orders.size, orders, errors))
-    if not tried:
+            tried.append((float(np.mean(errors)), orders, errors))
+    best = _smallest_near_least(tried)
+    if best is None or best[0] > _COUPLED * chosen[0]:
         return (), chosen
-    least = min(error for error, *_ in tried)
-    if least > _COUPLED * chosen[0]:
-        return (), chosen
-    near = [one for one in tried if one[0] <= max(_AS_GOOD * least, _EXACT)]
-    _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
+    least, orders, errors = best
     pairs = every
     for pair in every:
         fewer = tuple(one for one in pairs if one != pair)
@@ -355,19 +353,27 @@ def _smallest(
 
     The error of the smallest orders comes with them.
     """
-    tried: list[tuple[float, int, Orders, tuple[float, ...]]] = []
+    tried: list[_Choice] = []
     for na, n in product(
         range(least_na, MOST_LAGS + 1), range(1, MOST_LAGS + 1) if record.inputs else [0]
     ):
         orders = Orders(na, tuple(max(1, min(n, order)) for order in excited), nk)
         errors = _errors(record, orders, length, poles)
         if errors is not None and orders.size:
-            tried.append((float(np.mean(errors)), orders.size, orders, errors))
+            tried.append((float(np.mean(errors)), orders, errors))
+    return _smallest_near_least(tried)
+
+
+def _smallest_near_least(tried: Sequence[_Choice]) -> _Choice | None:
+    """Return the least error of all, with the smallest orders that come near it.
+
+    None where nothing was tried.
+    """
     if not tried:
         return None
     least = min(error for error, *_ in tried)
     near = [one for one in tried if one[0] <= max(_AS_GOOD * least, _EXACT)]
-    _, _, orders, errors = min(near, key=lambda one: (one[1], one[0]))
+    _, orders, errors = min(near, key=lambda one: (one[1].size, one[0]))
     return least, orders, errors
 
 
