@@ -61,6 +61,11 @@ class Run:
                 )
         return [self.names.index(name) for name in channels]
 
+    def outputs_or(self, channels: Channels) -> tuple[list[int], Matrix]:
+        """Return indices of channels, of the outputs without names, and a copy of their values."""
+        columns = self.columns(channels, range(self.inputs, len(self.names)))
+        return columns, self.values[:, columns].copy()
+
     def with_values(self, columns: list[int], values: Matrix) -> Run:
         """Return the experiment with other values in some columns."""
         changed = self.values.copy()
@@ -232,8 +237,7 @@ class Outliers:
         check_fields(self)
 
     def apply(self, run: Run) -> Run:
-        columns = run.columns(self.channels, range(run.inputs, len(run.names)))
-        values = run.values[:, columns].copy()
+        columns, values = run.outputs_or(self.channels)
         for x in values.T:
             distance, deviation = self.distances(x)
             x[distance > self.threshold * deviation] = np.nan
@@ -285,8 +289,7 @@ class Repeats:
         check_fields(self)
 
     def apply(self, run: Run) -> Run:
-        columns = run.columns(self.channels, range(run.inputs, len(run.names)))
-        values = run.values[:, columns].copy()
+        columns, values = run.outputs_or(self.channels)
         values[1:][values[1:] == values[:-1]] = np.nan
         return run.with_values(columns, values)
 
@@ -321,8 +324,7 @@ class Limits:
             raise InputError("`limits` has neither `low` nor `high`; give one of them.")
 
     def apply(self, run: Run) -> Run:
-        columns = run.columns(self.channels, range(run.inputs, len(run.names)))
-        values = run.values[:, columns].copy()
+        columns, values = run.outputs_or(self.channels)
         with np.errstate(invalid="ignore"):
             beyond = np.zeros(values.shape, dtype=bool)
             beyond |= False if self.low is None else values <= self.low

@@ -14,7 +14,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, Array, jax, quick_jit
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective, errors_of
+from orthaug.fitting.objective import FreeRunObjective, errors_of
 from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_problem import Layout, SegmentedProblem
 from orthaug.fitting.segments import Segments, begins_of, build_segments, few_lanes
@@ -216,24 +216,15 @@ class SegmentedMotion(SegmentedProblem):
             states.append(settle(*made)[0])
         return np.stack(states)
 
-    def mean_square(self, c: Vector, w: Any, tilt: object = None) -> float:
-        """Return the mean of squared errors over whole experiments.
-
-        Outputs in their deviations.
-
-        NaN where it diverges.
-
-        A whole experiment starts where a free run follows its first rows best.
-        """
+    def _mean_square(self, c: Vector, w: Any, tilt: object) -> float:
+        """Return the mean of squares; a whole experiment starts where its first rows say best."""
         longest = min(FIRST_ROWS, self.whole.steps)
         inputs, target, scored = (np.asarray(part)[:, :longest] for part in self.whole[1:])
         first = Segments(self.whole.start, inputs, target, scored)
-        with np.errstate(all="ignore"):
-            start = self.settle(c, w, first, 30)
-            errors = errors_of(self.dynamics, self.numbers(c, w), start, self.whole)
-            scaled = errors / self.deviation[:, None]
-            mean = float(np.sum(scaled**2)) / int(self.whole.observations.sum())
-        return mean if mean < RUNAWAY else np.nan
+        start = self.settle(c, w, first, 30)
+        errors = errors_of(self.dynamics, self.numbers(c, w), start, self.whole)
+        scaled = errors / self.deviation[:, None]
+        return float(np.sum(scaled**2)) / int(self.whole.observations.sum())
 
     def runs(self, c: AnyArray, w: Any, states: np.ndarray) -> Float[np.ndarray, "k T n0 m"]:
         """Return the states along every segment from these starts."""

@@ -260,13 +260,16 @@ class SegmentedProblem:
         NaN where it diverges.
         """
         with np.errstate(all="ignore"):
-            if self.sums is not None and self.whole is self.segments:
-                squares = self.sums.squares(self.dynamics, self.numbers(c, w, tilt), self.segments)
-                total = float(np.sum(np.diag(squares) / self.deviation**2))
-            else:
-                errors = errors_of(
-                    self.dynamics, self.numbers(c, w, tilt), self.whole.start, self.whole
-                )
-                total = float(np.sum((errors / self.deviation[:, None]) ** 2))
-            mean = total / int(self.whole.observations.sum())
+            mean = self._mean_square(c, w, tilt)
         return mean if mean < RUNAWAY else np.nan
+
+    def _mean_square(self, c: Vector, w: Vector, tilt: object) -> float:
+        """Return `mean_square` of runs that may be without bounds."""
+        numbers = self.numbers(c, w, tilt)
+        if self.sums is not None and self.whole is self.segments:
+            squares = self.sums.squares(self.dynamics, numbers, self.segments)
+            total = float(np.sum(np.diag(squares) / self.deviation**2))
+        else:
+            errors = errors_of(self.dynamics, numbers, self.whole.start, self.whole)
+            total = float(np.sum((errors / self.deviation[:, None]) ** 2))
+        return total / int(self.whole.observations.sum())

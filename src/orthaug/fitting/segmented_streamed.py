@@ -22,7 +22,7 @@ from orthaug.data.record import Experiment, Record
 from orthaug.data.sources import Source, Span, follows
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.initial_states import InitialStates, Start
-from orthaug.fitting.objective import RUNAWAY, FreeRunObjective
+from orthaug.fitting.objective import FreeRunObjective
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.rules import check_scored
 from orthaug.fitting.segment_sums import SegmentSums
@@ -95,15 +95,11 @@ class SegmentedStreamed(SegmentedLagged):
         made = (self.task.engine, self.source, self.found, self.dynamics, self.empty)
         return SourceSegments.cut(*made, segment, washout)
 
-    def mean_square(self, c: Vector, w: Any, tilt: Any = None) -> float:
+    def _mean_square(self, c: Vector, w: Any, tilt: Any) -> float:
         if not isinstance(self.whole, WholeRuns):
-            return super().mean_square(c, w, tilt)
-        with np.errstate(all="ignore"):
-            squares = self.whole.squares(self.dynamics, self.numbers(c, w, tilt))
-            mean = float(np.sum(squares / self.deviation**2)) / (
-                self.whole.count * len(self.deviation)
-            )
-        return mean if mean < RUNAWAY else np.nan
+            return super()._mean_square(c, w, tilt)
+        squares = self.whole.squares(self.dynamics, self.numbers(c, w, tilt))
+        return float(np.sum(squares / self.deviation**2)) / (self.whole.count * len(self.deviation))
 
     def end_in_memory(self, objective: FreeRunObjective, end: Descent) -> TrialInMemory:
         """Return the segments of the subsample.

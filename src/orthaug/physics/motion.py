@@ -564,21 +564,14 @@ class Motion(NotebookView):
         """
         if self.functions is not None:
             return xp.asarray(self.functions[0](x, u, p))
-        values = self.values(x, u, p, xp, self._read[0])
-        rates = [self.equations[state.name].value(values, xp) for state in self.states]
-        return xp.stack(
-            [xp.broadcast_to(xp.asarray(rate, dtype=float), x.shape[1:]) for rate in rates]
-        )
+        equations = [self.equations[state.name] for state in self.states]
+        return _stack(equations, self.values(x, u, p, xp, self._read[0]), x, xp)
 
     def observed(self, x: Any, u: Any, p: Any, xp: Any) -> Any:
         """Return h(x, u; p) (ny, …)."""
         if self.functions is not None:
             return xp.asarray(self.functions[1](x, u, p))
-        values = self.values(x, u, p, xp, self._read[1])
-        outputs = [expression.value(values, xp) for expression in self.observations]
-        return xp.stack(
-            [xp.broadcast_to(xp.asarray(output, dtype=float), x.shape[1:]) for output in outputs]
-        )
+        return _stack(self.observations, self.values(x, u, p, xp, self._read[1]), x, xp)
 
     def term_without_value(self, i: int, x: Vector, u: Vector) -> str:
         """Return the name and value of a term of equation i that is not finite, or nothing.
@@ -646,3 +639,9 @@ def _order(definitions: Mapping[str, Expression]) -> list[str]:
         raise InputError(
             f"motion.define: an algebraic loop, {loop}; no definition may need itself."
         ) from None
+
+
+def _stack(equations: Sequence[Expression], values: Mapping[str, Any], x: Any, xp: Any) -> Any:
+    """Return the values of equations, (n, …), at states (nx, …)."""
+    found = [xp.asarray(one.value(values, xp), dtype=float) for one in equations]
+    return xp.stack([xp.broadcast_to(value, x.shape[1:]) for value in found])

@@ -21,7 +21,7 @@ from orthaug.reports.page_fit import (
 )
 from orthaug.reports.page_runs import compared_plots
 from orthaug.reports.result import CompareResult, DifferenceResult
-from orthaug.reports.text import setting_cell
+from orthaug.reports.text import setting_rows
 
 _WORDS = {
     "helps": "the learner helps",
@@ -186,9 +186,6 @@ def _settings(result: CompareResult) -> list[Any]:
     """Return the keys in which the specs of saved results differ."""
     if not result.settings:
         return []
-    names = [row.name for row in result.comparison]
-    rows = [
-        [one.key, *(setting_cell(one.values[name]) for name in names)] for one in result.settings
-    ]
+    head, *rows = setting_rows(result)
     caption = "Keys of the specs whose values differ; a dash where the default holds."
-    return [Table(caption, ["setting", *names], rows)]
+    return [Table(caption, head, rows)]

@@ -231,14 +231,20 @@ def _setting_lines(result: CompareResult) -> list[str]:
     """Return the settings in which saved results differ; a dash where the default holds."""
     if not result.settings:
         return ["The settings are the same."]
+    return table(setting_rows(result))
+
+
+def setting_rows(result: CompareResult) -> list[list[str]]:
+    """Return the settings that differ, a row each with its values in each result, a head first."""
     names = [row.name for row in result.comparison]
     rows = [
-        [one.key, *(setting_cell(one.values[name]) for name in names)] for one in result.settings
+        [one.key, *(_setting_cell(one.values[name]) for name in names)]
+        for one in result.settings or ()
     ]
-    return table([["setting", *names], *rows])
+    return [["setting", *names], *rows]
 
 
-def setting_cell(value: object) -> str:
+def _setting_cell(value: object) -> str:
     """Return a value of a spec as a cell: as TOML has it, cut; a dash for none."""
     return "–" if value is None else cut(json.dumps(value, ensure_ascii=False), _LONGEST_SETTING)
 

@@ -23,6 +23,7 @@ from orthaug.selection.linear_runs import (
     best_free_run,
     driven_rows_of,
     from_poles,
+    lag_rows,
     reduced_poles,
 )
 from orthaug.selection.orders import Orders, correlated_delay
@@ -217,7 +218,9 @@ def _fit_together(
     """
     first = orders.first_row
     y = np.concatenate([e.outputs[first:] for e in experiments])[:cut]
-    phi = np.concatenate([_rows_together(e, orders) for e in experiments])[:cut]
+    phi = np.concatenate([lag_rows(e, range(e.outputs.shape[1]), orders) for e in experiments])[
+        :cut
+    ]
     kept = _columns_together(y.shape[1], orders, pairs)
     kept[-1] &= constant
     scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
@@ -243,13 +246,13 @@ def _fit_together(
         for e, run in zip(experiments, runs, strict=True):
             outputs = e.outputs.copy()
             outputs[first:] = run
-            modelled.append(_rows_together(replace(e, outputs=outputs), orders))
+            modelled.append(lag_rows(replace(e, outputs=outputs), range(outputs.shape[1]), orders))
         z = np.concatenate(modelled)[:cut]
     return best
 
 
 def _columns_together(ny: int, orders: Orders, pairs: Sequence[Pair]) -> Any:
-    """Return which columns (columns, ny) of `_rows_together` each output has."""
+    """Return which columns (columns, ny) of `lag_rows` of all outputs each output has."""
     other = orders.na * ny + sum(orders.nb) + 1
     kept = np.ones((other, ny), dtype=bool)
     for lag in range(orders.na):
@@ -257,19 +260,6 @@ def _columns_together(ny: int, orders: Orders, pairs: Sequence[Pair]) -> Any:
             for j in range(ny):
                 kept[lag * ny + j, i] = i == j or (i, j) in pairs
     return kept
-
-
-def _rows_together(e: Experiment, orders: Orders) -> Matrix:
-    """Return the rows of the past of all outputs, lag by lag, of the inputs, and 1."""
-    first, ny = orders.first_row, e.outputs.shape[1]
-    count = len(e) - first
-    past = [
-        e.outputs[first - i : first - i + count, j]
-        for i in range(1, orders.na + 1)
-        for j in range(ny)
-    ]
-    driven = driven_rows_of(e, orders)
-    return np.column_stack([*past, driven]) if past else driven
 
 
 def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:

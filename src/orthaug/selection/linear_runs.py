@@ -50,7 +50,7 @@ class OutputRows:
     @cached_property
     def lags(self) -> list[Matrix]:
         """Own past, inputs from their delays on, and 1, of each experiment."""
-        return [_lag_rows(e, self.output, self.orders) for e in self.experiments]
+        return [lag_rows(e, [self.output], self.orders) for e in self.experiments]
 
     @cached_property
     def measured(self) -> list[Vector]:
@@ -251,10 +251,14 @@ def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
     return np.linalg.solve(system, (instruments / scale).T @ target) / scale
 
 
-def _lag_rows(e: Experiment, j: int, orders: Orders) -> Matrix:
-    """Return the rows of own past, inputs from their delays on, and 1."""
+def lag_rows(e: Experiment, outputs: Sequence[int], orders: Orders) -> Matrix:
+    """Return the rows of some outputs' past, lag by lag, of inputs from their delays on, and 1."""
     first, count = orders.first_row, len(e) - orders.first_row
-    columns = [e.outputs[first - i : first - i + count, j] for i in range(1, orders.na + 1)]
+    columns = [
+        e.outputs[first - i : first - i + count, j]
+        for i in range(1, orders.na + 1)
+        for j in outputs
+    ]
     return np.column_stack([*columns, driven_rows_of(e, orders)])
 
 
