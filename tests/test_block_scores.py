@@ -188,7 +188,10 @@ def test_errors_that_remember_for_too_long_have_no_interval():
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     text = dict(fit.warnings)["too_long_memory"]
     assert "no standard errors and no intervals" in text and "longer segments" in text
-    assert "std         none" in fit.summary() and fit.split(Training()).std is None
+    assert "std         none" in fit.summary()
+    split = fit.split(Symmetrized())
+    assert split.std is None and split.interval is None
+    np.testing.assert_allclose(split.plain_std, plain.split(Symmetrized()).std, rtol=1e-12)
     assert default(fit) is fit
 
 
