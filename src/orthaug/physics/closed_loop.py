@@ -119,10 +119,15 @@ class ClosedLoop(Motion):
         values |= dict(zip((o.name for o in self.outputs), y, strict=True))
         return values
 
-    def control(self, y: Matrix, x: Matrix, u: Matrix, p: Vector, xp: ArrayModule) -> Matrix:
+    def _law_values(self, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> dict[str, Any]:
+        """Return the signals with what the controller computes of them."""
         values = self._signals(y, x, u, p)
         for name, expression in self._law[0]:
             values[name] = expression.value(values, xp)
+        return values
+
+    def control(self, y: Matrix, x: Matrix, u: Matrix, p: Vector, xp: ArrayModule) -> Matrix:
+        values = self._law_values(y, x, u, p, xp)
         return xp.stack(
             [xp.broadcast_to(xp.asarray(values[n], dtype=float), x.shape[1:]) for n in self.held]
         )
@@ -130,9 +135,7 @@ class ClosedLoop(Motion):
     def after_sample(self, following: Any, y: Any, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         if not self.discrete_states:
             return following
-        values = self._signals(y, x, u[len(self.held) :], p)
-        for name, expression in self._law[0]:
-            values[name] = expression.value(values, xp)
+        values = self._law_values(y, x, u[len(self.held) :], p, xp)
         new = dict(zip(self.discrete_states, self._law[1], strict=True))
         rows = [
             new[name].value(values, xp) if name in new else following[i]

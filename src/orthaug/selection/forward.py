@@ -63,22 +63,21 @@ class Equations(NamedTuple):
         hessian[np.ix_(picked, picked)], right[picked] = self.hessian, self.right
         return self._replace(hessian=hessian, right=right)
 
+    @property
+    def _unit(self) -> Vector:
+        """Factors that give columns of unit norm."""
+        size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
+        return 1 / np.where(size > 0, size, 1.0)
+
     def scaled(self) -> Equations:
         """Return the equations with columns of unit norm."""
-        size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
-        unit = 1 / np.where(size > 0, size, 1.0)
+        unit = self._unit
         return self._replace(hessian=self.hessian * np.outer(unit, unit), right=self.right * unit)
 
     def solve(self) -> Vector:
         """Return p, the shortest where columns depend on each other."""
-        size = np.sqrt(np.maximum(np.diag(self.hessian), 0.0))
-        unit = 1 / np.where(size > 0, size, 1.0)
-        return (
-            unit
-            * np.linalg.lstsq(self.hessian * np.outer(unit, unit), unit * self.right, rcond=1e-14)[
-                0
-            ]
-        )
+        scaled = self.scaled()
+        return self._unit * np.linalg.lstsq(scaled.hessian, scaled.right, rcond=1e-14)[0]
 
     def miss(self, p: Vector) -> float:
         """Return `‖y − S p‖²`."""

@@ -207,9 +207,7 @@ def from_both_starts(runs: TermRuns, chosen: Sequence[int]) -> Point:
     if (
         runs.layout is not None and chosen
     ):  # from physics alone a free run may end in a local minimum
-        nt = len(point.c)
-        p = runs.step_equations.of([*range(nt), *(nt + i for i in chosen)]).solve()
-        other = runs.fit(runs.start()._replace(chosen=tuple(chosen), c=p[:nt], w=p[nt:]), chosen)
+        other = _refit(runs, runs.start(), runs.step_equations, tuple(chosen))
         point = min(point, other, key=lambda one: one.loss)
     return point
 
