@@ -72,6 +72,7 @@ _FOR_THE_LIBRARY = {
         "coordinates",
         "free_covariance",
         "judged_record",
+        "restarts_at",
         "layout",
         "lines",
         "moved_by",
