@@ -210,7 +210,8 @@ class FreeRunTask(SimulationTask):
     def on(self, record: Record) -> FreeRunTask:
         """Return the task on another record."""
         like = None if isinstance(self.plan, SegmentedStreamed) else self.plan
-        return FreeRunTask(SegmentedLagged.of(self.rows_task.on(record), self.criterion, like))
+        segmented = SegmentedLagged.of(self.rows_task.on(record), self.criterion, like)
+        return FreeRunTask(segmented, doubts_evidence=self.doubts_evidence)
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress

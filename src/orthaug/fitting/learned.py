@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -130,6 +130,10 @@ class Task(Protocol):
 
     def on(self, record: Record) -> Task:
         """Return the task on another record."""
+        ...
+
+    def after(self, runs: Sequence[Any]) -> Task:
+        """Return the task for further runs; what none of `runs` needed is not tried again."""
         ...
 
     def physics_alone(self) -> tuple[Any, TrainedLearner]:

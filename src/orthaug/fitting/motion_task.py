@@ -390,7 +390,7 @@ class MotionTask(SimulationTask):
         segmented = SegmentedMotion.of(
             self.problem.on(record), self.bound, self.criterion, self.plan, sums
         )
-        return MotionTask(segmented)
+        return MotionTask(segmented, doubts_evidence=self.doubts_evidence)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
         """Return the task without a learner, and the residual of physics alone.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -131,6 +132,10 @@ class OneStepTask(TrainingRows):
     def on(self, record: Record) -> OneStepTask:
         """Return the task on another record."""
         return OneStepTask.of(self.problem.on(record), self.bound.learner, engine=self.engine)
+
+    def after(self, runs: Sequence[Any]) -> OneStepTask:
+        """Return the task itself: runs one step ahead try nothing more."""
+        return self
 
     def prepare(
         self, solver: Solver, structure: Structure, progress: RunProgress = quiet

@@ -43,6 +43,8 @@ class FreeRunFit(NamedTuple):
     restarted: tuple[float | None, float] | None = None
     """Errors in deviations of the outputs, from the declared initial values (None without a run)
     and from those drawn instead; None where the declared ones were kept."""
+    begun_anew: bool = False
+    """True where evidence had settled early, and began again from a run without a prior."""
 
     @property
     def ending(self) -> Ending:

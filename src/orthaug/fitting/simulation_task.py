@@ -7,6 +7,7 @@ the loss is accepted, so that no run ends above physics alone.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -31,6 +32,7 @@ from orthaug.inference.covariance import theta_block
 from orthaug.models.learners import Bound, remembers
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
+_NOTICEABLE = 0.1  # of −2 log L: two steps that gain less end a look for more
 _CLEARLY = 4.0  # −2 log L for each weight: what more weights must gain
 
 
@@ -73,6 +75,12 @@ class SimulationTask(ABC):
     plan: Any
     """The `SegmentedProblem`."""
     physics: FreeRunFit | None = None
+    doubts_evidence: bool = True
+    """Whether a run without a prior looks for what evidence may have missed."""
+
+    def after(self: Task, runs: Sequence[FreeRunFit]) -> Task:
+        """Return the task for further runs: evidence is doubted where it failed one of `runs`."""
+        return replace(self, doubts_evidence=any(run.begun_anew for run in runs))
 
     @abstractmethod
     def train_physics_only(
@@ -189,9 +197,10 @@ class SimulationTask(ABC):
         # The weights of a memory are needed only when others have grown: too late for evidence
         if not (evidence and remembers(self.bound.learner)):
             first = plan.descend(objective, best.p, solver, report, best.states, **kept, **options)
-            if not evidence or first.ending is Ending.STOPPED:
+            if not (evidence and self.doubts_evidence) or first.ending is Ending.STOPPED:
                 return self._below_physics(first)
-        free = plan.descend(objective, best.p, solver.within_limit, report, best.states, **kept)
+        looking = solver.within_limit.until(_NOTICEABLE / plan.residuals)
+        free = plan.descend(objective, best.p, looking, report, best.states, **kept)
         if not _lowers_loss(free, best.loss):
             return self._below_physics(free if first is None else first)
         settled = first if first is not None and _lowers_loss(first, best.loss) else None
@@ -207,7 +216,7 @@ class SimulationTask(ABC):
                 "iterations": free.iterations + chosen.iterations,
                 "seconds": free.seconds + chosen.seconds,
             }
-            chosen = chosen._replace(**spent)
+            chosen = chosen._replace(**spent, begun_anew=settled is not None)
         return self._below_physics(chosen)
 
     def _is_clearly_better(self, one: FreeRunFit, by_evidence: FreeRunFit) -> bool:

@@ -385,7 +385,7 @@ def _held_out(
         return None
     LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(starts))
     ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
-    taken = max(run.iterations for run in runs)
+    taken, task = max(run.iterations for run in runs), task.after(runs)
     given = (task, list(zip(starts, ridges, strict=True)), structure, solver, taken)
     found = runner.map(_on_fold, given, folds.pairs)
     pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]

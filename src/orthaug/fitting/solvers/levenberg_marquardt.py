@@ -61,6 +61,10 @@ class LevenbergMarquardt:
         """The solver without iterations past the limit, for runs that only lead to others."""
         return self.at_most(self.iterations)
 
+    def until(self, tolerance: float) -> LevenbergMarquardt:
+        """Return the solver that ends at larger steps, if its own tolerance is smaller."""
+        return replace(self, tolerance=max(self.tolerance, tolerance))
+
     def after(self, done: int) -> LevenbergMarquardt:
         """Return the solver with the iterations that are left after `done` of them."""
         limit = self.limit()
