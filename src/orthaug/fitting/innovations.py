@@ -108,7 +108,8 @@ class InnovationsTask(MotionTask):
     """A motion in innovations form, in segments, and its predictor without a learner."""
 
     def on(self, record: Record) -> InnovationsTask:
-        return replace(self, plan=super().on(record).plan, physics=None)
+        own = super().on(record)
+        return replace(self, plan=own.plan, physics=None, known=own.known)
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
@@ -116,7 +117,11 @@ class InnovationsTask(MotionTask):
         problem, plan = self.problem, self.plan
         plant = replace(problem, motion=problem.motion.plant)
         free, begun = train_motion_physics(
-            SegmentedMotion.of(plant, plan.bound, plan.criterion, like=plan), solver
+            SegmentedMotion.of(plant, plan.bound, plan.criterion, like=plan),
+            solver,
+            known=None
+            if self.known is None
+            else self.known[: len(plant.motion.coordinates.initial)],
         )
         plan = replace(plan.with_substeps(free.dynamics.substeps), loose=free.loose)
         own = plan.physics_only

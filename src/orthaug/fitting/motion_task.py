@@ -67,17 +67,25 @@ _LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs deter
 
 
 def train_motion_physics(
-    segmented: SegmentedMotion, solver: LevenbergMarquardt, progress: RunProgress = quiet
+    segmented: SegmentedMotion,
+    solver: LevenbergMarquardt,
+    progress: RunProgress = quiet,
+    known: Vector | None = None,
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Return parameters of physics alone, and segments that start at its states.
 
     Where it does not follow the outputs from the declared initial values, others are drawn, and
     the best end is taken if it halves the error. None where no run is finite.
+
+    Args:
+        known: where a descent on more rows ended; this one begins there.
     """
     own, coordinates = segmented.physics_only, segmented.problem.motion.coordinates
-    best = descend_by_lengths(own, solver, coordinates.initial, progress)
-    if is_cheap(own) and (best is None or not _follows(own, best)):
-        best = _descend_from_others(own, solver, best)
+    best = None if known is None else descend_from(own, solver, [known], None, progress)
+    if best is None:
+        best = descend_by_lengths(own, solver, coordinates.initial, progress)
+        if is_cheap(own) and (best is None or not _follows(own, best)):
+            best = _descend_from_others(own, solver, best)
     if best is None:
         return segmented, None
     best = _from_settled_states(own, solver, best)
@@ -357,6 +365,8 @@ class MotionTask(SimulationTask):
     """A motion in segments, and the run of its physics alone."""
 
     plan: SegmentedMotion
+    known: Vector | None = None
+    """Where physics alone ended on the record that this one is a part of."""
 
     @classmethod
     def of(
@@ -390,7 +400,8 @@ class MotionTask(SimulationTask):
         segmented = SegmentedMotion.of(
             self.problem.on(record), self.bound, self.criterion, self.plan, sums
         )
-        return MotionTask(segmented, doubts_evidence=self.doubts_evidence)
+        known = None if self.physics is None else np.asarray(self.physics.end.point.theta)
+        return MotionTask(segmented, doubts_evidence=self.doubts_evidence, known=known)
 
     def physics_alone(self) -> tuple[MotionTask, TrainedLearner]:
         """Return the task without a learner, and the residual of physics alone.
@@ -462,7 +473,7 @@ class MotionTask(SimulationTask):
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:
-        return train_motion_physics(self.plan, solver, progress)
+        return train_motion_physics(self.plan, solver, progress, self.known)
 
     def scaled(self, plan: SegmentedMotion, physics: FreeRunFit) -> SegmentedMotion:
         """Return the size of the learner's features and of the quantities it is added to.
