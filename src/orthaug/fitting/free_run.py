@@ -191,7 +191,8 @@ class FreeRunTask(SimulationTask):
             InputError: nothing would be scored; whole experiments of rows that are not in memory.
         """
         plan = SegmentedStreamed if isinstance(task.problem, StreamedProblem) else SegmentedLagged
-        return cls(plan.of(task, criterion), None, warm).with_checkpoints(task.checkpoints)
+        begun = cls(plan.of(task, criterion), warm=warm)
+        return begun.with_checkpoints(task.checkpoints)
 
     @property
     def rows_task(self) -> OneStepTask:
