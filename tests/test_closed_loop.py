@@ -46,6 +46,11 @@ INPUTS = {
     "steps with noise": lambda rng: held(rng, 25) + 0.02 * rng.normal(size=ROWS),
     "stairs": lambda rng: np.repeat(np.abs(np.arange(ROWS // 10 + 1) % 16 - 8.0), 10)[:ROWS],
     "sine with noise": lambda rng: np.sin(np.arange(ROWS) / 17) + 0.05 * rng.normal(size=ROWS),
+    "steps on a sine": lambda rng: held(rng, 10) + 2 * np.sin(np.arange(ROWS) / 67),
+    "sun between clouds": lambda rng: (
+        (2 + np.sin(np.pi * np.arange(ROWS) / ROWS))
+        * np.where(np.repeat(rng.random(ROWS // 40 + 1) < 0.35, 40)[:ROWS], 0.3, 1.0)
+    ),
     "chirp": lambda rng: ss.chirp(np.arange(ROWS), 0.002, ROWS, 0.1),
     "ramps": lambda rng: np.interp(
         np.arange(ROWS), np.arange(0, ROWS + 40, 40), rng.uniform(-2, 2, ROWS // 40 + 2)

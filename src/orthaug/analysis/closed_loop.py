@@ -35,7 +35,9 @@ _EXCHANGED = 0.1  # of an input, by past outputs: less is rather weak feedback
 # Of an output, by past inputs: what speaks against an effect of an input
 _NO_EFFECT, _ABSENT = 0.01, 0.1  # level, and the share that there is at most
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
-_ROUNDS = 4
+_ROUNDS = 8
+_AFTER = 3  # rows behind a jump, from which level, slope and curvature of what follows are read
+_ENOUGH = 0.4  # of all rows: what must be left without these
 _SWITCHES = 8  # of an input of two levels, up and down each
 _UNEVEN = 0.1  # deviation over mean of the lengths between them
 # Of the distance of the values at which it switches up and down: their scatter, and how far the
@@ -294,20 +296,30 @@ def _tested_share(own: Matrix, others: Matrix, target: Vector) -> tuple[Share, f
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """Return the rows on which an input does not jump.
+    """Return the rows on which an input does not jump, nor has jumped just before.
 
-    Jumps of a reference would hide everything between them.
+    Jumps of a reference would hide everything between them. The lags of the rows just behind one
+    straddle it: of an input that moves smoothly between its jumps, such as sunlight between clouds,
+    no linear filter predicts these rows, and their error is spread over all others. Outputs, which
+    have a longer memory, would seem to predict it.
     """
-    base, kept = (
-        np.column_stack([np.ones(len(target)), _scale(own)]),
-        np.ones(len(target), dtype=bool),
-    )
+    base = np.column_stack([np.ones(len(target)), _scale(own)])
+    kept = np.ones(len(target), dtype=bool)
     for _ in range(_ROUNDS):
         if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
             break
         left = np.abs(target - base @ np.linalg.lstsq(base[kept], target[kept], rcond=1e-10)[0])
-        kept = left <= _JUMP * max(float(np.median(left)), _NOTHING * float(target.std()))
+        median = max(float(np.median(left[kept])), _NOTHING * float(target.std()))
+        kept = _settled(left > _JUMP * median)
     return kept
+
+
+def _settled(jumps: np.ndarray) -> np.ndarray:
+    """Return the rows without a jump and not just behind one, where these are enough."""
+    settled = ~jumps
+    for rows in range(1, _AFTER + 1):
+        settled[rows:] &= ~jumps[:-rows]
+    return settled if settled.sum() > _ENOUGH * len(jumps) else ~jumps
 
 
 def _wald(columns: Matrix, target: Vector) -> float:
