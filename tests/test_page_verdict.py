@@ -266,3 +266,14 @@ def test_a_warning_that_intervals_leave_something_out_is_in_the_verdict(code):
     assert found.level == "care"
     assert "Do not read a as physics yet" in found.use
     assert "read a as physics" in fit_verdict(fitted()).use
+
+
+def test_what_a_warning_supposes_of_a_parameter_the_verdict_does_not_assert():
+    """Missing memory, as creep, looks like an offset that moves over the record."""
+    for code, supposed in (
+        ("parameter_drift", "a parameter seems to change over its record"),
+        ("parameter_depends", "a parameter seems to depend on a signal"),
+    ):
+        said = fit_verdict(fitted(warnings=[Warning(code=code, text="")]))
+        assert said.level == "care" and supposed in said.trust
+        assert "as physics yet" in said.use
