@@ -277,3 +277,17 @@ def test_what_a_warning_supposes_of_a_parameter_the_verdict_does_not_assert():
         said = fit_verdict(fitted(warnings=[Warning(code=code, text="")]))
         assert said.level == "care" and supposed in said.trust
         assert "as physics yet" in said.use
+
+
+@pytest.mark.parametrize("code", ["no_help", "helps"])
+def test_a_learner_that_does_not_help_is_no_reason_to_leave_parameters_undetermined(code):
+    both = [KNOWN, KNOWN.model_copy(update={"name": "b", "shared": True})]
+    found = fitted(parameters=both, validation=judged(code))
+    said = fit_verdict(found).use
+    assert "The data alone do not determine b" in said
+    without = 'without it (`learner.kind = "none"`) the data determine b, if no physics is missing'
+    assert (without in said) == (code == "no_help")
+    doubted = found.model_copy(
+        update={"residuals": told().model_copy(update={"verdict": "unmodelled"})}
+    )
+    assert "without it" not in fit_verdict(doubted).use

@@ -450,6 +450,11 @@ def _use_text(result: FitResult, level: str) -> str:
     if shared:
         text += f". The data alone do not determine {join_words(shared)}, because the learner could"
         text += f" imitate {'it' if len(shared) == 1 else 'them'}"
+        if _code(result) == "no_help" and _noise_alone(result):
+            text += (
+                '. The learner does not help: without it (`learner.kind = "none"`) the data '
+                f"determine {join_words(shared)}, if no physics is missing"
+            )
     return f"Use it to {text}."
 
 
