@@ -97,7 +97,7 @@ def train_motion_physics(
     x, _ = segmented.physics_only.trajectory(point.theta, (), states)
     size = np.abs(x).max(axis=0, initial=0.0)
     segmented = replace(segmented.from_states(states), loose=LOOSE * np.where(size > 0, size, 1.0))
-    mean_square = segmented.physics_only.mean_square(point.theta, ())
+    mean_square = segmented.physics_only.mean_square(point.theta, np.zeros(0))
     return segmented, best._replace(mean_square=mean_square, **spent)
 
 
