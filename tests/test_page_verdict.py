@@ -13,6 +13,7 @@ from orthaug.analysis.findings import (
     AdviceTrialsResult,
     BiasResult,
     DiagnosisResult,
+    MotionFitResult,
     ValidationResult,
 )
 from orthaug.analysis.fit_findings import (
@@ -277,6 +278,15 @@ def test_what_a_warning_supposes_of_a_parameter_the_verdict_does_not_assert():
         said = fit_verdict(fitted(warnings=[Warning(code=code, text="")]))
         assert said.level == "care" and supposed in said.trust
         assert "as physics yet" in said.use
+
+
+@pytest.mark.parametrize("moved", [0.004, 0.006])
+def test_a_parameter_that_a_finer_integrator_would_move_is_not_read_as_physics(moved):
+    motion = MotionFitResult.model_construct(substep_bias={"a": moved})
+    said = fit_verdict(fitted().model_copy(update={"motion": motion}))
+    coarse = moved > 0.5 * 0.01
+    assert ("to read a as physics" in said.use) != coarse
+    assert ("more substeps of its integrator would move a" in said.trust) == coarse
 
 
 @pytest.mark.parametrize("code", ["no_help", "helps"])

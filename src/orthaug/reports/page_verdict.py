@@ -17,6 +17,7 @@ from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResu
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
+_COARSE = 0.5  # standard errors that finer integration may move a parameter
 _SURE = 0.1  # standard error over value up to which a parameter counts as known
 _NAMED = 0.5  # share of the learned part from which its cause is the first advice
 _AGREES = 1.0  # standard errors up to which parameters of two results are called the same
@@ -331,6 +332,9 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             yield "its residual could not be tested"
         elif result.residuals.verdict == "equation_noise" and _has_warning(result, _COLOURED):
             yield "its errors are large and correlated with their past"
+    coarse = _moved_by_integrator(result)
+    if coarse:
+        yield f"more substeps of its integrator would move {join_words(coarse)}"
     untested = (text for code, text in _UNTESTED.items() if _has_warning(result, code))
     yield from dict.fromkeys(untested)
     if is_biased_by_feedback(result):
@@ -365,6 +369,17 @@ def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
 def _errors_of(row: ParameterResult) -> float:
     """Return the size of its bias in standard errors."""
     return abs(row.bias.value or 0.0) / row.std if row.bias and row.std else 0.0
+
+
+def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
+    """Return the parameters that twice the substeps would move by half a standard error or more."""
+    motion = getattr(result, "motion", None)
+    moved = {} if motion is None else motion.substep_bias or {}
+    return [
+        row.name
+        for row in _rows(result)
+        if row.std and abs(moved.get(row.name) or 0.0) > _COARSE * row.std
+    ]
 
 
 def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
@@ -409,8 +424,8 @@ _UNTESTED = {
 
 
 def _use_text(result: FitResult, level: str) -> str:
-    rows = _rows(result)
-    sure = [row.name for row in rows if _is_known(row)]
+    rows, coarse = _rows(result), _moved_by_integrator(result)
+    sure = [row.name for row in rows if _is_known(row) and row.name not in coarse]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
     doubted = untested or is_biased_by_feedback(result)
     known = sure if _noise_alone(result) and not doubted else []
