@@ -560,13 +560,13 @@ def test_wrong_samples_are_marked_before_anything_else_is_tried(tmp_path):
 def test_columns_in_another_unit_are_converted_before_terms_are_advised(tmp_path):
     """A swing in degrees under a spec in rad: terms were advised that bend the sine."""
     rng, x, rows = np.random.default_rng(8), np.array([0.0, 0.0]), []
-    u = np.repeat(rng.uniform(-40, 40, 30), 20)
+    u = np.repeat(rng.uniform(-2, 2, 15), 20)
     for value in u:
         rows.append(x[0])
         for _ in range(4):
             rate = value - 30 * np.sin(x[0]) - x[1]
             x = x + 0.0125 * np.array([x[1], rate])
-    angle = np.degrees(np.array(rows)) + 0.1 * rng.normal(size=600)
+    angle = np.degrees(np.array(rows)) + 0.1 * rng.normal(size=300)
     text = SWING + '[data.channels]\nangle = { column = "angle [deg]", unit = "rad" }\n'
     spec = put(tmp_path, text, np.column_stack([u, angle]), "u,angle [deg]")
     result = oa.fit_spec(str(spec)).result

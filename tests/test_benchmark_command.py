@@ -204,6 +204,8 @@ def test_a_package_that_fails_does_not_end_the_run(tiny, data, tmp_path, monkeyp
 
 
 def test_sets_without_files_are_named_and_all_without_is_refused(tiny, data, tmp_path):
+    one_model = tiny.read_text(encoding="utf-8").partition('[[models]]\nname = "motion"')[0]
+    tiny.write_text(one_model, encoding="utf-8")
     other = TINY.replace("tiny/data.csv", "other/data.csv").replace("GOOD", "1.0")
     (tiny.parent / "other.toml").write_text(other, encoding="utf-8")
     declared.public_sets.cache_clear()

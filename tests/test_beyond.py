@@ -1,6 +1,7 @@
 """What a learned correction does beyond its training: the physics goes on with its θ, and what it adds is bounded."""
 
 import json
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -43,8 +44,11 @@ PHYSICS = oa.Baseline.from_terms(
 )
 
 
+@cache
 def fitted(**learner) -> oa.Model:
-    return oa.estimate(plant(), PHYSICS, learner=oa.MLP(hidden=(6,), **learner)).model
+    learner = oa.MLP(hidden=(6,), **learner)
+    options = {"criterion": oa.Prediction(), "regularization": 1e-3, "standard_errors": "plain"}
+    return oa.estimate(plant(), PHYSICS, learner=learner, **options).model
 
 
 def far(model: oa.Model, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +103,10 @@ def test_a_learner_of_a_difference_is_held_in_the_difference():
     terms = [oa.Term("p", "y[k-1]"), oa.Term("v", "y[k-1] - y[k-2]"), oa.Term("b", "u[k-1]")]
     learner = oa.MLP(hidden=(6,), inputs=("y[k-1] - y[k-2]",))
     model = oa.estimate(
-        oa.Record.from_arrays(u=u, y=x), oa.Baseline.from_terms(terms), learner=learner
+        oa.Record.from_arrays(u=u, y=x),
+        oa.Baseline.from_terms(terms),
+        learner=learner,
+        criterion=oa.Prediction(),
     ).model
     here, there = (
         model.predict(oa.Record.from_arrays(u=u, y=x + moved)).trajectories[0].learner[2:]

@@ -338,9 +338,7 @@ def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory):
     """The spec, the printed text and the rows of a comparison on the free run with a test part."""
-    spec = project(
-        tmp_path_factory.mktemp("compare") / "p", SMALL, FREE.replace("= 25", "= 10"), FAR
-    )
+    spec = project(tmp_path_factory.mktemp("compare") / "p", SMALL, FREE + "iterations = 10\n", FAR)
     write_csv(spec.parent / "far.csv", **system(1, 150, square=0.3, sensor=0.3))
     done = run("compare", spec, "--out", spec.parent / "out")
     assert (done.code, done.err) == (0, "")

@@ -18,7 +18,7 @@ from orthaug import (
 )
 from orthaug.physics.projection import Projection
 
-SEEDS = range(3)
+SEEDS = range(2)
 LEARNERS = [
     None,
     MLP(hidden=()),

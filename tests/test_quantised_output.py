@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -18,6 +20,7 @@ WAYS = {
 }
 
 
+@cache
 def spin(seed: int, rows: int = 1000) -> tuple[np.ndarray, np.ndarray]:
     """Voltage and speed of a motor with friction, by SciPy."""
     rng = np.random.default_rng(seed)

@@ -79,6 +79,21 @@ def browser():
         browser.close()
 
 
+@pytest.fixture(scope="module")
+def opened(browser, folder):
+    """Pages that several tests look at, each opened once."""
+    kept: dict[tuple[str, str], Shown] = {}
+
+    def page_of(name: str, scheme: str = "light"):
+        if (name, scheme) not in kept:
+            kept[name, scheme] = Shown(browser, folder / f"{name}.html", scheme=scheme)
+        return kept[name, scheme].page
+
+    yield page_of
+    for shown in kept.values():
+        shown.context.close()
+
+
 class Shown:
     """A page that was opened and drawn, with what the browser complained of and asked for."""
 
@@ -147,120 +162,116 @@ def test_a_page_is_drawn_without_error_and_network_and_fits_its_width(
 @pytest.mark.parametrize(
     ("name", "scheme"), [("fit", "light"), ("fit", "dark"), ("compared", "light")]
 )
-def test_axe_finds_nothing(browser, folder, name, scheme):
+def test_axe_finds_nothing(opened, name, scheme):
     axe = pytest.importorskip(
         "axe_playwright_python.sync_playwright", reason="axe is not installed"
     )
-    with Shown(browser, folder / f"{name}.html", scheme=scheme) as page:
-        found = axe.Axe().run(page)
-        assert found.violations_count == 0, found.generate_report()
+    page = opened(name, scheme)
+    found = axe.Axe().run(page)
+    assert found.violations_count == 0, found.generate_report()
 
 
-def test_a_zoom_moves_every_panel_and_shows_more_of_a_long_record(browser, folder):
-    with Shown(browser, folder / "long.html") as page:
-        plot = run_plot(page)
-        curves = f"document.querySelector('{plot}').data"
-        low, high = shown_range(page, plot)
-        assert high - low == pytest.approx(0.399)  # 400 samples of 1 ms
-        button = page.locator("#free-run .whole-record").first
-        button.click()
-        until(page, f"document.querySelector('{plot}').layout.xaxis.range[1] > 99")
-        named = f"{curves}.filter(t => ['measured', 'model'].includes(t.name)).map(t => t.fill)"
-        until(page, f'JSON.stringify({named}) == \'["toself","none"]\'')  # both are seen
-        assert button.get_attribute("aria-pressed") == "true"
-        assert page.evaluate(f"Math.max(...{curves}.map(t => t.x.length))") < 6000
-        upper = page.locator(f"{plot} .nsewdrag").first
-        upper.scroll_into_view_if_needed()
-        box = upper.bounding_box()
-        page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 50)
-        page.mouse.down()
-        page.mouse.move(box["x"] + 0.52 * box["width"], box["y"] + 50, steps=4)
-        page.mouse.up()
-        until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] > 1")
-        low, high = shown_range(page, plot)
-        assert 49 < low < high < 53
-        until(page, f"{curves}[0].x.length < 7000 && {curves}[0].x[1] - {curves}[0].x[0] < 0.0011")
-        ranges = page.evaluate(f"{curves}.map(t => [t.xaxis ?? 'x', t.x[0], t.x.at(-1)])")
-        assert len({tuple(entry) for entry in ranges}) == 1, (
-            "all curves live on the same stretch of the same axis"
-        )
+def test_a_zoom_moves_every_panel_and_shows_more_of_a_long_record(opened):
+    page = opened("long")
+    plot = run_plot(page)
+    curves = f"document.querySelector('{plot}').data"
+    low, high = shown_range(page, plot)
+    assert high - low == pytest.approx(0.399)  # 400 samples of 1 ms
+    button = page.locator("#free-run .whole-record").first
+    button.click()
+    until(page, f"document.querySelector('{plot}').layout.xaxis.range[1] > 99")
+    named = f"{curves}.filter(t => ['measured', 'model'].includes(t.name)).map(t => t.fill)"
+    until(page, f'JSON.stringify({named}) == \'["toself","none"]\'')  # both are seen
+    assert button.get_attribute("aria-pressed") == "true"
+    assert page.evaluate(f"Math.max(...{curves}.map(t => t.x.length))") < 6000
+    upper = page.locator(f"{plot} .nsewdrag").first
+    upper.scroll_into_view_if_needed()
+    box = upper.bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.52 * box["width"], box["y"] + 50, steps=4)
+    page.mouse.up()
+    until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] > 1")
+    low, high = shown_range(page, plot)
+    assert 49 < low < high < 53
+    until(page, f"{curves}[0].x.length < 7000 && {curves}[0].x[1] - {curves}[0].x[0] < 0.0011")
+    ranges = page.evaluate(f"{curves}.map(t => [t.xaxis ?? 'x', t.x[0], t.x.at(-1)])")
+    assert len({tuple(entry) for entry in ranges}) == 1, (
+        "all curves live on the same stretch of the same axis"
+    )
 
 
-def test_keys_move_zoom_and_reset_a_run(browser, folder):
-    with Shown(browser, folder / "fit.html") as page:
-        plot = run_plot(page)
-        whole = shown_range(page, plot)
-        page.locator(plot).focus()
-        page.keyboard.press("+")
-        until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] != {whole[0]}")
-        near = shown_range(page, plot)
-        assert near[1] - near[0] == pytest.approx((whole[1] - whole[0]) / 2)
-        page.keyboard.press("ArrowRight")
-        until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] > {near[0]}")
-        page.keyboard.press("0")
-        until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] == {whole[0]}")
-        assert shown_range(page, plot) == whole
+def test_keys_move_zoom_and_reset_a_run(opened):
+    page = opened("fit")
+    plot = run_plot(page)
+    whole = shown_range(page, plot)
+    page.locator(plot).focus()
+    page.keyboard.press("+")
+    until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] != {whole[0]}")
+    near = shown_range(page, plot)
+    assert near[1] - near[0] == pytest.approx((whole[1] - whole[0]) / 2)
+    page.keyboard.press("ArrowRight")
+    until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] > {near[0]}")
+    page.keyboard.press("0")
+    until(page, f"document.querySelector('{plot}').layout.xaxis.range[0] == {whole[0]}")
+    assert shown_range(page, plot) == whole
 
 
 def test_the_contents_are_reached_and_followed_by_keys(browser, folder):
-    with Shown(browser, folder / "fit.html") as page:
+    page = Shown(browser, folder / "fit.html").page  # where nothing has the focus yet
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    page.keyboard.press("Tab")
+    for link in page.locator("nav a").all():
+        target = link.get_attribute("href")
+        assert page.evaluate("document.activeElement.getAttribute('href')") == target
         page.keyboard.press("Tab")
-        assert page.evaluate("document.activeElement.className") == "skip"
-        page.keyboard.press("Tab")
-        for link in page.locator("nav a").all():
-            target = link.get_attribute("href")
-            assert page.evaluate("document.activeElement.getAttribute('href')") == target
-            page.keyboard.press("Tab")
-        last = page.locator("nav a").last
-        last.focus()
-        page.keyboard.press("Enter")
-        until(
-            page, "document.querySelector('#reproduce').getBoundingClientRect().top < innerHeight"
-        )
-        assert page.url.endswith("#reproduce")
+    last = page.locator("nav a").last
+    last.focus()
+    page.keyboard.press("Enter")
+    until(page, "document.querySelector('#reproduce').getBoundingClientRect().top < innerHeight")
+    assert page.url.endswith("#reproduce")
 
 
-def test_folded_sections_open_by_their_link_with_whole_plots(browser, folder):
-    with Shown(browser, folder / "fit.html") as page:
-        folded = page.locator("#residuals > .folded")
-        assert folded.get_attribute("open") is None
-        page.locator("nav a[href='#residuals']").click()
-        until(page, "document.querySelector('#residuals > .folded').open")
-        inside = "[...document.querySelectorAll('#residuals .plot')]"
-        until(page, f"{inside}.every(p => p.layout.width === p.clientWidth && p.clientWidth > 0)")
+def test_folded_sections_open_by_their_link_with_whole_plots(opened):
+    page = opened("fit")
+    folded = page.locator("#residuals > .folded")
+    assert folded.get_attribute("open") is None
+    page.locator("nav a[href='#residuals']").click()
+    until(page, "document.querySelector('#residuals > .folded').open")
+    inside = "[...document.querySelectorAll('#residuals .plot')]"
+    until(page, f"{inside}.every(p => p.layout.width === p.clientWidth && p.clientWidth > 0)")
 
 
-def test_a_change_of_theme_colours_the_curves_anew(browser, folder):
-    with Shown(browser, folder / "fit.html") as page:
-        color = (
-            f"document.querySelector('{run_plot(page)}').data.find(t => t.name == "
-            "'model').line.color"
-        )
-        light = page.evaluate(color)
-        page.emulate_media(color_scheme="dark")
-        until(page, f"{color} != '{light}'")
+def test_a_change_of_theme_colours_the_curves_anew(opened):
+    page = opened("fit")
+    color = (
+        f"document.querySelector('{run_plot(page)}').data.find(t => t.name == 'model').line.color"
+    )
+    light = page.evaluate(color)
+    page.emulate_media(color_scheme="dark")
+    until(page, f"{color} != '{light}'")
+    page.emulate_media(color_scheme="light")
+    until(page, f"{color} == '{light}'")
 
 
-def test_a_divergence_is_marked(browser, folder):
-    with Shown(browser, folder / "long.html") as page:
-        assert "free run diverges in y" in page.locator("#free-run .plot").nth(1).inner_text()
+def test_a_divergence_is_marked(opened):
+    page = opened("long")
+    assert "free run diverges in y" in page.locator("#free-run .plot").nth(1).inner_text()
 
 
-def test_on_paper_every_plot_is_whole(browser, folder):
-    with Shown(browser, folder / "fit.html", scheme="dark") as page:
-        widths = "[...document.querySelectorAll('.plot')].map(p => p.layout.width)"
-        page.evaluate(f"addEventListener('beforeprint', () => {{ window.seen = [{widths}, "
-                      "getComputedStyle(document.documentElement).getPropertyValue('--paper').trim()]; })")  # fmt: skip
-        paper = page.pdf(format="A4", prefer_css_page_size=True)
-        seen, colour = page.evaluate("window.seen")
-        assert colour in ("#ffffff", "#fff") and max(seen) <= 182 / 25.4 * 96, (
-            "the width of A4 less its margins"
-        )
-        assert (
-            paper.startswith(b"%PDF")
-            and 3 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", paper)) <= 20
-        )
-        assert min(page.evaluate(widths)) > 0 and max(page.evaluate(widths)) > max(seen)
+def test_on_paper_every_plot_is_whole(opened):
+    page = opened("fit", "dark")
+    widths = "[...document.querySelectorAll('.plot')].map(p => p.layout.width)"
+    page.evaluate(f"addEventListener('beforeprint', () => {{ window.seen = [{widths}, "
+                  "getComputedStyle(document.documentElement).getPropertyValue('--paper').trim()]; })")  # fmt: skip
+    paper = page.pdf(format="A4", prefer_css_page_size=True)
+    seen, colour = page.evaluate("window.seen")
+    assert colour in ("#ffffff", "#fff") and max(seen) <= 182 / 25.4 * 96, (
+        "the width of A4 less its margins"
+    )
+    assert paper.startswith(b"%PDF") and 3 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", paper)) <= 20
+    assert min(page.evaluate(widths)) > 0 and max(page.evaluate(widths)) > max(seen)
 
 
 def _light(rgb: np.ndarray) -> float:
@@ -274,12 +285,12 @@ def _colour(text: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_numbers_in_the_cells_of_a_map_can_be_read(browser, folder, scheme):
-    with Shown(browser, folder / "fit.html", scheme=scheme) as page:
-        (map_,) = page.evaluate(
-            "[...document.querySelectorAll('.plot')].filter(p => p.layout.annotations?.length && "
-            "p.data[0].type === 'heatmap').map(p => [p.data[0], p.layout.annotations])"
-        )
+def test_numbers_in_the_cells_of_a_map_can_be_read(opened, scheme):
+    page = opened("fit", scheme)
+    (map_,) = page.evaluate(
+        "[...document.querySelectorAll('.plot')].filter(p => p.layout.annotations?.length && "
+        "p.data[0].type === 'heatmap').map(p => [p.data[0], p.layout.annotations])"
+    )
     trace, written = map_
     scale = [(at, _colour(text)) for at, text in trace["colorscale"]]
     contrasts = []

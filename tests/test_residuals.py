@@ -231,7 +231,7 @@ def test_ljung_box_of_uneven_errors_is_its_formula():
 
 
 def test_ljung_box_keeps_its_level_over_many_short_experiments():
-    e = np.random.default_rng(12).normal(size=(RECORDS, 10, 30))
+    e = np.random.default_rng(12).normal(size=(RECORDS // 2, 10, 30))
     assert BETWEEN[0] < np.mean([ljung_box(list(one)).p < 0.01 for one in e]) < 0.02
 
 
