@@ -174,3 +174,11 @@ def without_figures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orthaug.commands.fit._draw", lambda *_: None)
         yield
+
+
+@pytest.fixture(scope="module")
+def without_trials() -> Iterator[None]:
+    """Fits whose advice is not looked at try no changed specs; test_advice and golden tests do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("orthaug.commands.advice._tried", lambda *_: None)
+        yield

@@ -31,7 +31,7 @@ from orthaug import (
 )
 from orthaug.analysis.imitation import imitation
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 NAMES, INITIAL, ROWS = ("a", "b", "c"), np.array([0.7, -0.4, 0.2]), 90
 LM, GRADIENT = LevenbergMarquardt(60, tolerance=1e-14), AdamLBFGS(20, 400)

@@ -190,11 +190,8 @@ def fewer(arrays):
     del arrays[str(len(arrays) - 1)]
 
 
-@pytest.mark.parametrize(
-    "change", [no_number, partial(no_number, value=np.inf), other_shape, fewer]
-)
 @pytest.mark.parametrize("driven", [False, True], ids=["compiled", "driven"])
-def test_a_forged_state_with_its_checksum_is_none(tmp_path, change, driven):
+def test_a_forged_state_with_its_checksum_is_none(tmp_path, driven):
     chosen = options(InMemory()) | (
         {"criterion": oa.Simulation(segment=20, washout=2)} if driven else {}
     )
@@ -206,10 +203,12 @@ def test_a_forged_state_with_its_checksum_is_none(tmp_path, change, driven):
     file.write_bytes(forged(whole, lambda arrays: None))
     expected = fit(posed(1), **chosen, checkpoints=kept)
     assert kept.spoilt == [], "what is only copied is sound"
-    file.write_bytes(forged(whole, change))
-    found = fit(posed(1), **chosen, checkpoints=kept)
-    assert kept.spoilt[:1] == [file.name]
-    np.testing.assert_array_equal(found.theta, expected.theta)
+    for change in (no_number, partial(no_number, value=np.inf), other_shape, fewer):
+        kept.spoilt.clear()
+        file.write_bytes(forged(whole, change))
+        found = fit(posed(1), **chosen, checkpoints=kept)
+        assert kept.spoilt[:1] == [file.name]
+        np.testing.assert_array_equal(found.theta, expected.theta)
 
 
 def test_states_of_another_fit_are_refused(tmp_path):

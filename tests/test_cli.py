@@ -125,6 +125,9 @@ def make_project(folder: Path, spec: str = SPEC) -> Path:
     return folder / "plant.toml"
 
 
+pytestmark = pytest.mark.usefixtures("without_trials")
+
+
 @pytest.fixture(autouse=True)
 def _only_what_tests_share_is_drawn(monkeypatch):
     monkeypatch.setattr("orthaug.commands.fit._draw", lambda *_: None)

@@ -20,7 +20,7 @@ from test_cli import MLP as NETWORK
 
 from orthaug import load, save
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 @pytest.fixture

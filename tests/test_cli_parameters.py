@@ -53,7 +53,7 @@ MACHINE = TERMS + PHYSICS
 VELOCITY = "(position[k-1] - position[k-2])/Ts"
 
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 def euler(m, cd, ks, sign=1, ts=0.01) -> np.ndarray:

@@ -11,7 +11,7 @@ import pytest
 from helpers import unfolded
 from test_cli import RESULT_KEYS, finite_json, one_line, run, write_csv
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 SPEC = """
 [data]

@@ -18,7 +18,7 @@ from test_cli import run
 
 import orthaug as oa
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 TS, ROWS = 0.02, 500
 TRUE = {"a": 9.0, "c": 0.3, "b": 2.0}

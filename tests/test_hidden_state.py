@@ -16,7 +16,7 @@ from orthaug.analysis.family_tests import Family, _test_families
 from orthaug.analysis.hidden_state import structure_test
 from orthaug.analysis.parameter_changes import _turn_of
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 TS = 0.05
 DATA = '[data]\ninputs = ["u"]\noutputs = ["y"]\nsampling_time = 0.05\ntrain = { files = ["run.csv"] }\n'

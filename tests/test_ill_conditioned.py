@@ -11,7 +11,7 @@ from test_cli import run, write_csv
 
 import orthaug as oa
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 LAGGED = """
 [data]

@@ -386,7 +386,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.usefixtures("without_figures")
+@pytest.mark.usefixtures("without_figures", "without_trials")
 def test_a_spec_declares_it_and_the_result_has_it(folder: Path, alone: Any) -> None:
     (folder / "spec.toml").write_text(SPEC + '[noise]\nmodel = "innovations"\n')
     done = run("fit", folder / "spec.toml", "--out", folder / "out")
@@ -410,7 +410,7 @@ def test_a_spec_declares_it_and_the_result_has_it(folder: Path, alone: Any) -> N
     assert again.code == 0, again.err
 
 
-@pytest.mark.usefixtures("without_figures")
+@pytest.mark.usefixtures("without_figures", "without_trials")
 def test_a_spec_lets_the_data_choose_the_noise(folder: Path) -> None:
     (folder / "auto.toml").write_text(SPEC + '[noise]\nmodel = "auto"\n')
     done = run("fit", folder / "auto.toml", "--out", folder / "chosen")

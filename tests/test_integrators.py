@@ -15,7 +15,7 @@ import orthaug as oa
 from orthaug.analysis.input_timing import rows_of_trials
 from orthaug.physics.integrators import INTEGRATORS, Integrator
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STEP = 0.05  # s
 

@@ -10,7 +10,7 @@ from test_cli import run
 
 import orthaug as oa
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STEP, ROWS, TRAIN = 0.02, 2400, 1600
 TRUE = {"m": 1.0, "k": 4.0}

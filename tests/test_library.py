@@ -14,7 +14,7 @@ from test_compare import STARTED
 import orthaug as oa
 from orthaug import InputError
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 @pytest.fixture(scope="module")

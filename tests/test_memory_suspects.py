@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from test_cli import finite_json, run
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STEP, LAG = 0.05, 0.4  # s
 POLE = float(np.exp(-STEP / LAG))

@@ -254,7 +254,7 @@ def test_npz(tmp_path):
 # --- through the spec
 
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import orthaug as oa
 from orthaug.data.gaps import complete_record, held_rows, regular_rows
 from orthaug.data.wild import data_warnings
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STEP = 0.05
 TRUE = {"tau": 0.8, "gain": 2.0}

@@ -21,6 +21,8 @@ import orthaug as oa
 from orthaug import InputError, read_record
 from orthaug.analysis.motion_modes import motion_stability
 
+pytestmark = pytest.mark.usefixtures("without_trials")
+
 SPEC = """
 [data]
 sampling_time = 0.01

@@ -13,7 +13,7 @@ from test_motion_cli import orthaug
 import orthaug as oa
 from orthaug import read_record
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STIFFNESS, DAMPING, TS = 12.0, 0.15, 0.04
 SPEC = f"""

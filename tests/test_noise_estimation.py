@@ -388,7 +388,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.usefixtures("without_figures")
+@pytest.mark.usefixtures("without_figures", "without_trials")
 def test_a_spec_declares_it_and_the_result_has_it(folder: Path) -> None:
     (folder / "spec.toml").write_text(SPEC + '[noise]\nmodel = "auto"\nlargest = 2\n')
     done = run("fit", folder / "spec.toml", "--out", folder / "out")

@@ -18,7 +18,7 @@ import orthaug as oa
 from orthaug._base.lines import percent
 from orthaug.analysis.observer_noise import by_verdict, to_keep
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 PHYSICS = oa.Baseline.from_terms(
     [oa.Term("a", "y[k-1]"), oa.Term("b", "y[k-2]"), oa.Term("g", "u[k-1]")]

@@ -296,7 +296,7 @@ output_weights = WEIGHTS
 """
 
 
-@pytest.mark.usefixtures("without_figures")
+@pytest.mark.usefixtures("without_figures", "without_trials")
 @pytest.mark.parametrize(
     ("weights", "kind"),
     [('"none"', "none"), ('"covariance"', "covariance"), ("[1, 0.01]", "given")],

@@ -13,7 +13,7 @@ from test_cli import run
 import orthaug as oa
 from orthaug import Record
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 PHYSICS = oa.Baseline.from_terms(
     [oa.Term("a", "y[k-1]", initial=0.5), oa.Term("b", "u[k-1]", initial=0.3)]

@@ -15,7 +15,7 @@ from orthaug import InputError
 from orthaug.data.preparation import steps_again, warnings_of
 from orthaug.data.prepared import Preparation
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 T = 0.01
 TIME = T * np.arange(1000)

@@ -32,7 +32,7 @@ from orthaug.inference.kinds import MEASURES
 from orthaug.inference.measures import Measure, Points
 from orthaug.models.kinds import LEARNERS
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from test_cli import MLP, SPEC, listing, make_project, one_line, run, signals, w
 import orthaug as oa
 from orthaug import InputError
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 HELD_OUT = SPEC.replace("[data.tests", '[data.validation]\nfiles = ["valid.csv"]\n[data.tests')
 NETWORK = HELD_OUT.replace('kind = "none"\n', MLP)

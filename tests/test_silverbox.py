@@ -7,7 +7,7 @@ import json
 import pytest
 from test_cli import run
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 SPEC = """
 [data]

@@ -15,7 +15,7 @@ import orthaug as oa
 from orthaug import HammersteinWiener, Record
 from orthaug.physics.systems import SYSTEMS
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 A, B = np.array([-1.2, 0.5]), np.array([1.0, 2 / 3])
 

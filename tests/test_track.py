@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from test_cli import finite_json, listing, make_project, one_line, run, signals, write_csv
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 @pytest.fixture(scope="module")

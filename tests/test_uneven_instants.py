@@ -11,7 +11,7 @@ from test_cli import run
 
 import orthaug as oa
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 TRUE = {"m": 1.0, "c": 0.6, "k": 12.0}
 SPEC = """

@@ -24,7 +24,7 @@ from orthaug import (
 )
 from orthaug.fitting.rules import choose_regularizations
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 TRAIN, VALIDATION = record_of(0, rows=60), record_of(1, rows=90)
 OPTIONS = {"learner": MLP(hidden=(8,)), "solver": LevenbergMarquardt(iterations=60)}

@@ -187,7 +187,7 @@ kind = "none"
 """
 
 
-pytestmark = pytest.mark.usefixtures("without_figures")
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 
 def fitted(folder: Path, spec: str) -> dict:
