@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_export import moving
 
 import orthaug as oa
 from orthaug._base import kept_programs
@@ -118,6 +119,26 @@ def test_a_digest_is_of_the_content() -> None:
     different = [0, 0.0, -0.0, False, None, "0", b"0", (0,), [0], ((0,), 0), {"0": 0}, np.zeros(1)]
     assert len({digest_of(value) for value in different}) == len(different)
     assert digest_of({1, 2, 3}) == digest_of({3, 2, 1})
+
+
+def test_initial_values_bounds_and_units_are_not_of_a_program() -> None:
+    """Who changes them in a spec compiled every program of the fit anew."""
+
+    def form_of(feature: str = "v", **changed: Any) -> Any:
+        gain = oa.PhysicalParameter("b", **{"initial": 0.9, "unit": "1/s"} | changed)
+        motion = oa.Motion.from_equations(
+            [oa.State("v", "b*u - c*v", "y", learned=True)],
+            [oa.Output("y", "v")],
+            [gain, oa.PhysicalParameter("c", 0.4)],
+            ["u"],
+        )
+        return moving(motion, (feature,), oa.MLP((3,))).form
+
+    own = form_of()
+    for other in (form_of(initial=2.0), form_of(unit="1/min"), form_of(max=9.0)):
+        assert other == own and hash(other) == hash(own) and digest_of(other) == digest_of(own)
+    assert form_of(min=0) != own  # a positive parameter is estimated as its logarithm
+    assert form_of("b*v") != form_of("b*v", initial=2.0)  # the feature has its initial value
 
 
 def test_what_is_not_known_by_content_is_refused() -> None:

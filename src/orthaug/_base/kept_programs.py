@@ -89,9 +89,13 @@ def _feed(add: Callable[[bytes], Any], value: Any) -> None:
     elif dataclasses.is_dataclass(value) and kind.__module__.startswith("orthaug."):
         if hasattr(value, "files"):  # physics of a file, which may change
             raise NotKept(_name_of(kind))
-        for field in dataclasses.fields(value):
-            add(field.name.encode())
-            _feed(add, getattr(value, field.name))
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        if hasattr(value, "computation"):  # the rest does not count, but must be known all the same
+            digest_of(fields)
+            fields = {"computation": value.computation}
+        for name, one in fields.items():
+            add(name.encode())
+            _feed(add, one)
     else:
         raise NotKept(_name_of(kind))
 

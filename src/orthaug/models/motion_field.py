@@ -8,8 +8,8 @@ weights. `parts_at` returns what physics and learner add at many points.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,12 @@ from orthaug.physics.motion import Motion
 _LARGE = 150  # operations in the expressions of a motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionField:
     """A motion with a learner at a point, without its numbers.
 
     `features` are expressions of states and inputs; `substeps` the integrator's in a sample of
-    `sampling_time` s.
+    `sampling_time` s. Two are equal where one compiled program serves both.
     """
 
     motion: Motion
@@ -40,6 +40,27 @@ class MotionField:
     bound: Bound
     sampling_time: float
     substeps: int
+
+    @cached_property
+    def computation(self) -> tuple[Any, ...]:
+        """What its computations depend on.
+
+        Initial values, bounds and units are not among it: who changes them waits for no compiler.
+        """
+        motion, seen = self.motion, {name for entry in self.features for name in entry.names}
+        given = {own.name: getattr(motion, own.name) for own in fields(motion) if own.compare}
+        given["states"] = tuple(replace(state, unit="") for state in motion.states)
+        given["parameters"] = motion.names, tuple(motion.coordinates.positive.tolist())
+        if not seen <= set(motion.visible):  # features of parameters are those of the initial ones
+            given["initial"] = tuple(motion.initial.tolist())
+        own = self.features, self.bound, self.sampling_time, self.substeps
+        return type(self), *own, type(motion), *given.items()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MotionField) and self.computation == other.computation
+
+    def __hash__(self) -> int:
+        return hash(self.computation)
 
     @property
     def states(self) -> int:

@@ -304,7 +304,7 @@ def _finite(slope: Array) -> Array:
 _FEWER = 128  # rows per compiled call, where each calls the host
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionDynamics(MotionField, AutodiffDynamics):
     """A motion with a learner as dynamics, without its numbers: `Dynamics`."""
 

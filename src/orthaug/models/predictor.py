@@ -23,7 +23,7 @@ from orthaug.physics.innovations import InnovationsForm
 from orthaug.physics.motion import Motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PredictorDynamics(MotionDynamics):
     """The predictor of a motion, in innovations form or with a gain that is given."""
 
