@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from functools import cache
+from types import CodeType
+
 import numpy as np
 
 from orthaug import MLP, Experiment, Model, Record
 
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "exp", "abs", "sign", "tanh")}
+
+
+@cache
+def code(text: str) -> CodeType:
+    """Return an expression as Python compiles it, once for all rows."""
+    return compile(text, text, "eval")
 
 
 def row(
@@ -19,7 +28,7 @@ def row(
     baseline, moved, raw = np.zeros((3, len(form.outputs)))
     if form.learns:
         z = np.array(
-            [float(eval(str(e), {"__builtins__": {}}, names)) for e in form.features.entries]
+            [float(eval(code(str(e)), {"__builtins__": {}}, names)) for e in form.features.entries]
         )
         if numbers.limits is not None:
             low, high = numbers.limits
@@ -37,7 +46,9 @@ def row(
         raw = np.asarray(numbers.gain) * network(model, (z - numbers.centre) / numbers.halfwidth)
     for term in form.baseline.terms:
         i = form.outputs.index(term.output or form.outputs[0])
-        value, there = (eval(term.regressor, {"__builtins__": {}}, own) for own in (names, inside))
+        value, there = (
+            eval(code(term.regressor), {"__builtins__": {}}, own) for own in (names, inside)
+        )
         if term.fixed:
             baseline[i] += term.initial * value
         else:

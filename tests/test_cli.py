@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -153,7 +154,10 @@ def fitted(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory) -> tuple[Done, Path]:
-    """The demo with one restart of each structure, for θ of the orthogonal one is that of all."""
+    """The demo with one restart of each structure, for θ of the orthogonal one is that of all.
+
+    The additive one, of which only a line is printed, is trained for a few iterations.
+    """
     from orthaug.commands import demo as command
 
     folder = tmp_path_factory.mktemp("demo")
@@ -162,6 +166,8 @@ def demo(tmp_path_factory) -> tuple[Done, Path]:
         assert command.RESTARTS > 1 and several in command.SPEC
         patch.setattr(command, "SPEC", command.SPEC.replace(several, "restarts = 1\n"))
         patch.setattr(command, "RESTARTS", 1)
+        few = orthaug.LevenbergMarquardt(10)
+        patch.setattr(command, "estimate", partial(orthaug.estimate, solver=few))
         return run("demo", "--out", folder / "out"), folder / "out"
 
 

@@ -17,6 +17,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
+from orthaug.physics.closed_loop import in_loop
 
 pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
@@ -321,8 +322,8 @@ def test_the_plant_of_a_loop(beside_a_learner: Any, tmp_path: Path) -> None:
     assert "no part of it" in (tmp_path / "code" / "README.md").read_text(encoding="utf-8")
 
 
-def test_a_motion_without_a_controller_is_its_own_plant() -> None:
-    plant = oa.estimate(of_loop(), motion(), learner=None, controller=pid()).model.plant
+def test_a_motion_without_a_controller_is_its_own_plant(beside_a_learner: Any) -> None:
+    plant = beside_a_learner.model.plant
     assert plant.plant is plant
 
 
@@ -361,7 +362,7 @@ def test_a_loop_without_a_delay_is_refused() -> None:
     refused("algebraic loop: the output 'angle' contains the input 'torque'", plant)
     refused("algebraic loop, ", controller=by_equations("e", define={"e": "angle - torque"}))
     late = by_equations("held", oa.State("held", "3*(reference - angle)", 0.0))
-    oa.estimate(of_loop(), plant, learner=None, controller=late)  # acts a sample later
+    in_loop(plant, late, of_loop())  # acts a sample later
 
 
 def test_improper_and_empty_controllers_are_refused() -> None:

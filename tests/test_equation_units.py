@@ -12,6 +12,8 @@ import orthaug as oa
 from orthaug.analysis.equation_units import equation_units
 from orthaug.commands.opening import open_job
 
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
+
 SPEC = """
 [data]
 sampling_time = 0.05

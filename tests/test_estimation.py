@@ -140,8 +140,10 @@ def test_arguments_refused(record, arguments, message):
 @pytest.mark.parametrize(
     ("names", "declared"),
     [
-        ({"structure": "additive"}, {"structure": Additive()}),
-        ({"criterion": "simulation"}, {"criterion": Simulation()}),
+        (
+            {"structure": "additive", "criterion": "simulation"},
+            {"structure": Additive(), "criterion": Simulation()},
+        ),
         ({"criterion": "auto", "structure": "orthogonal"}, {"criterion": Auto()}),
         ({"solver": "levenberg-marquardt"}, {"solver": LevenbergMarquardt()}),
     ],

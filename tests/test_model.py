@@ -180,16 +180,18 @@ def test_simulated_parts_add_up(case):
     assert trajectory.start == model.form.first_row and trajectory.diverged is None
 
 
-@pytest.mark.parametrize("usable", [1, 255, 256, 257, 4096, 4097])
-def test_lengths_around_the_padding(first_order, usable):
-    record = one_signal(np.random.default_rng(4), usable + 1)
-    close(first_order.predict(record).model, naive.predicted(first_order, record))
-    close(
-        first_order.simulate(record, "zero").model,
-        naive.simulated(first_order, record, np.zeros((1, 1))),
-    )
-    if usable > 1:
-        close(first_order.predict(record, horizon=2).model, naive.predicted(first_order, record, 2))
+def test_lengths_around_the_padding(first_order):
+    whole = one_signal(np.random.default_rng(4), 4098)
+    (experiment,) = whole.experiments
+    ahead, two_ahead = (naive.predicted(first_order, whole, horizon) for horizon in (1, 2))
+    free = naive.simulated(first_order, whole, np.zeros((1, 1)))
+    for usable in (1, 255, 256, 257, 4096, 4097):
+        n = usable + 1
+        record = replace(whole, experiments=(experiment.rows(0, n),))
+        close(first_order.predict(record).model, ahead[:n])
+        close(first_order.simulate(record, "zero").model, free[:n])
+        if usable > 1:
+            close(first_order.predict(record, horizon=2).model, two_ahead[:n])
 
 
 def test_experiments_do_not_meet(first_order):

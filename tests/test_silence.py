@@ -62,7 +62,7 @@ def self_excited(seed: int) -> oa.Record:
     return oa.Record.from_arrays(u=inputs, y=y + noise, sampling_time=0.1)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 7])
+@pytest.mark.parametrize("seed", [1, 7])
 def test_evidence_that_settles_with_few_weights_is_begun_where_training_without_it_ends(seed):
     """From a silent learner it ended at 4 to 5 times the noise, and mu at 0.56 to 0.83 for 0.8."""
     motion = oa.Motion.from_equations(

@@ -7,6 +7,8 @@ import pytest
 
 import orthaug as oa
 
+pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
+
 STEP = 0.01
 
 
