@@ -652,7 +652,7 @@ def test_drag_of_a_pendulum_is_named_and_no_friction_that_pushes():
 def test_a_spring_and_friction_are_named_where_they_act_against_a_state(cube, friction, words):
     """A cube of an input with a negative sign was a hardening spring, too."""
     rng = np.random.default_rng(7)
-    force = np.repeat(rng.uniform(-2, 2, 40), 10)
+    force = np.repeat(rng.uniform(-2, 2, 60), 10)
     x, v, y, fine = 0.0, 0.0, [], 40
     for u in force:
         y.append(x)
@@ -661,7 +661,7 @@ def test_a_spring_and_friction_are_named_where_they_act_against_a_state(cube, fr
             v += 0.05 / fine * (u - 0.8 * v - 10 * x + spring + 0.3 * friction * np.sign(v))
             x += 0.05 / fine * v
     record = oa.Record.from_arrays(
-        u=force, y=np.array(y) + 0.01 * np.std(y) * rng.normal(size=400), sampling_time=0.05
+        u=force, y=np.array(y) + 0.01 * np.std(y) * rng.normal(size=600), sampling_time=0.05
     )
     motion = oa.Motion.from_equations(
         [
