@@ -90,9 +90,10 @@ def _feed(add: Callable[[bytes], Any], value: Any) -> None:
         if hasattr(value, "files"):  # physics of a file, which may change
             raise NotKept(_name_of(kind))
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        if hasattr(value, "computation"):  # the rest does not count, but must be known all the same
+        computation = getattr(value, "computation", None)
+        if computation is not None:  # the rest does not count, but must be known all the same
             digest_of(fields)
-            fields = {"computation": value.computation}
+            fields = {"computation": computation}
         for name, one in fields.items():
             add(name.encode())
             _feed(add, one)
