@@ -294,7 +294,8 @@ def _physics_alone(fit: MotionEstimate) -> tuple[MotionTask, LevenbergMarquardt]
     solver, posed = LevenbergMarquardt().within_limit, fit.problem
     posed = posed if fit.learns else posed.without_learner()
     learner = fit.model.form.bound.learner
-    return on_longest(posed, fit.criterion, solver, Orthogonal(), learner), solver
+    known = np.asarray(fit.alone)
+    return on_longest(posed, fit.criterion, solver, Orthogonal(), learner, known), solver
 
 
 def _predictable(

@@ -137,15 +137,20 @@ def on_longest(
     solver: Any,
     structure: Structure,
     learner: Learner | None = None,
+    known: Vector | None = None,
 ) -> MotionTask:
     """Return the physics trained on the first rows of the longest experiment.
 
-    Arguments as in `try_holds`.
+    Other arguments as in `try_holds`.
+
+    Args:
+        known: where physics alone ended on all rows; training begins there.
     """
     longest = max(problem.record.experiments, key=len)
     first = longest.rows(0, rows_of_trials(problem))
     record = replace(problem.record, experiments=(first,))
-    return MotionTask.of(problem.on(record), learner, criterion).prepare(solver, structure)
+    task = MotionTask.of(problem.on(record), learner, criterion)
+    return replace(task, known=known).prepare(solver, structure)
 
 
 def _try_hold(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
