@@ -316,6 +316,31 @@ def test_of_a_lag_and_a_delay_the_one_of_the_lower_error_is_advised(tmp_path, by
 
 
 @pytest.mark.slow
+def test_a_state_that_is_missing_is_tried_as_one(tmp_path):
+    """A wall that takes heat and gives it back: it was named, and terms of one row were tried."""
+    random = np.random.default_rng(5)
+    u = np.repeat(random.uniform(0, 2, 20), 20)
+    x, wall, y = 0.0, 0.0, []
+    for now in u:
+        y.append(x)
+        for _ in range(10):
+            x += 0.1 * ((2 * now - x) / 10 + (wall - x) / 15)
+            wall += 0.1 * (x - wall) / 30
+    data = np.column_stack([u, y + 0.005 * np.std(y) * random.normal(size=len(y))])
+    text = TANK + '[learner]\nkind = "none"\n'
+    fitted = oa.fit_spec(str(put(tmp_path, text, data, "u,T")))
+    first = fitted.result.advice[0]
+    assert "the missing state z (dz/dt = (x - z)/T2) in the equation of x" in first.text
+    assert first.after < 0.2 * first.before
+    spec = tmp_path / "spec.toml"
+    spec.write_text(tomlkit.dumps(apply_change(tomllib.loads(text), first.change)))
+    followed = oa.fit_spec(str(spec))
+    found = {row.name: row for row in followed.result.parameters}
+    low, high = found["T2"].ci95
+    assert low < 30 < high and followed.result.residuals.verdict == "white"
+
+
+@pytest.mark.slow
 def test_what_a_change_explains_is_called_no_disturbance(tmp_path):
     """A hardening spring under a low and a high force was a disturbance, and the term in `Next` the remedy."""
     random, names = np.random.default_rng(12), []

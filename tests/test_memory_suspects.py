@@ -10,6 +10,9 @@ import pandas as pd
 import pytest
 from test_cli import finite_json, run
 
+from orthaug.analysis.memory import MemoryTerm, derivative_of
+from orthaug.data.expressions import parse_named
+
 pytestmark = pytest.mark.usefixtures("without_figures", "without_trials")
 
 STEP, LAG = 0.05, 0.4  # s
@@ -202,3 +205,18 @@ def test_a_design_and_another_measure_say_that_they_cannot(tmp_path, monkeypatch
     for command in ("check", "fit"):
         done = run(command, "spec.toml")
         assert done.code == 2 and "has memory: it has values along a record only" in done.err
+
+
+@pytest.mark.parametrize("kind", ["lag", "lugre", "bouc_wen"])
+def test_the_derivative_of_a_term_s_state_is_the_limit_of_its_steps(kind):
+    """Of x = sin t: Euler steps of the equation that is proposed, beside the recursion."""
+    step, scale = 1e-3, 0.4
+    text = derivative_of(kind, "x", "v", "z", "w")
+    assert text is not None and derivative_of("backlash", "x", "v", "z", "w") is None
+    derivative = parse_named(text, {"x": 0.0, "v": 0.0, "z": 0.0, "w": scale}, "the state")
+    time, z, found = step * np.arange(3001), 0.0, []
+    for x, v in zip(np.sin(time), np.cos(time), strict=True):
+        found.append(z)
+        z += step * float(derivative.value({"x": x, "v": v, "z": z, "w": scale}, np))
+    expected = MemoryTerm(kind, "x", scale).along(np.sin(time), step)
+    np.testing.assert_allclose(found, expected, atol=2e-3)

@@ -71,6 +71,28 @@ class MemoryTerm:
         return np.array(found)
 
 
+def derivative_of(kind: str, on: str, rate: str | None, state: str, scale: str) -> str | None:
+    """Return the derivative of a term's internal state as an expression; None where it has none.
+
+    A lag follows its signal, `(x - z)/T`; hysteresis follows the rate of its signal, by the limits
+    of `MemoryTerm.along` for short samples. Backlash jumps.
+
+    Args:
+        rate: the derivative of the signal `on`; None where that is not known.
+        state: the name of the state z.
+        scale: the name of the time constant or width.
+    """
+    if kind == "lag":
+        return f"({on} - {state})/{scale}"
+    if rate is None:
+        return None
+    d = rate if rate.isidentifier() else f"({rate})"
+    return {
+        "lugre": f"{d} - abs({d})*{state}/{scale}",
+        "bouc_wen": f"{d} - (abs({d})*abs({state})*{state} + {d}*{state}**2)/(2*{scale}**2)",
+    }.get(kind)
+
+
 def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
     """Return the terms of every kind on a signal, with their grids of time constants and widths."""
     size = float(np.std(values))

@@ -26,7 +26,7 @@ from orthaug.reports.result import DataResult, PreparedResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
-    from orthaug.analysis.findings import LateInputResult, SuspectResult
+    from orthaug.analysis.findings import LateInputResult, MemoryResult, SuspectResult
     from orthaug.fitting.checkpoints import Checkpoints
     from orthaug.fitting.criteria import Criterion
     from orthaug.fitting.estimates import Estimate
@@ -218,6 +218,18 @@ class JobPhysics(ABC, Generic[P, F]):
 
         Args:
             name: of a new parameter, the time constant.
+        """
+
+    def with_state(
+        self, job: Job, missing: MemoryResult, names: tuple[str, str, str]
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the change of a spec that adds a state which is missing, and what that is.
+
+        None where the physics cannot have it.
+
+        Args:
+            missing: the term with memory that predicts the free run's error.
+            names: of the state, of its time constant or width, and of its coefficient.
         """
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
+from orthaug.analysis.memory import derivative_of
 from orthaug.analysis.suspects import MotionSuspect
 from orthaug.commands.job import Job, JobPhysics, Variant, declared_output
 from orthaug.commands.spec import Spec, spec_error
@@ -27,7 +28,7 @@ from orthaug.reports.result import CheckResult
 
 if TYPE_CHECKING:
     from orthaug.analysis.design import Design
-    from orthaug.analysis.findings import LateInputResult
+    from orthaug.analysis.findings import LateInputResult, MemoryResult
     from orthaug.analysis.input_timing import Trial
     from orthaug.fitting.motion_estimate import MotionEstimate
     from orthaug.models.response import Response
@@ -173,14 +174,42 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.states.{other}.{key}": word.sub(state, str(entry[key]))
             for other, entry in states.items()
         }
-        record = job.train.record
-        place = [channel.name for channel in record.inputs].index(late.input)
-        first = float(record.experiments[0].inputs[0, place])
+        first = _first_of(job, late.input)
         change |= {
             f"motion.states.{state}": {key: f"({late.input} - {state})/{name}", "start": first},
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
         return change, f"a lag of {late.input} (the state {state}, time constant {name})"
+
+    def with_state(
+        self, job: Job, missing: MemoryResult, names: tuple[str, str, str]
+    ) -> tuple[dict[str, Any], str] | None:
+        motion, states = self.motion, job.declaration.get("motion", {}).get("states")
+        if not states or motion.functions is not None or motion.scheme.discrete:
+            return None
+        if motion.definitions or missing.equation not in states or missing.scale is None:
+            return None
+        key, (state, scale, size) = motion.equation_key, names
+        moves = str(states[missing.on][key]) if missing.on in states else None
+        derivative = derivative_of(missing.kind, missing.on, moves, state, scale)
+        if derivative is None:
+            return None
+        own = states[missing.equation][key]
+        change: dict[str, Any] = {
+            f"motion.states.{missing.equation}.{key}": f"{own} + {size}*{state}",
+            f"motion.states.{state}": {key: derivative, "start": self._rest_of(job, missing)},
+            f"motion.parameters.{scale}": {"initial": float(f"{missing.scale:.3g}"), "min": 0},
+            f"motion.parameters.{size}": {"initial": 0.0},
+        }
+        place = f"in the equation of {missing.equation}"
+        return change, f"the missing state {state} (d{state}/dt = {derivative}) {place}"
+
+    def _rest_of(self, job: Job, missing: MemoryResult) -> float | str:
+        """Return the start of a state with memory: a lag begins at its signal, hysteresis at 0."""
+        if missing.kind != "lag":
+            return 0.0
+        own = job.declaration["motion"]["states"].get(missing.on)
+        return _first_of(job, missing.on) if own is None else own.get("start", 0.0)
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:
@@ -488,3 +517,10 @@ def _has_term(equation: str, expression: str, varying: Sequence[str]) -> bool:
     constant = rf"(?:\)|(?<![\w.*]){factor})(?:\*{factor})*"
     whole = rf"{constant}\*(?:{term}|\({term}\))(?![\w.*(])"
     return re.search(whole, "".join(equation.split())) is not None
+
+
+def _first_of(job: Job, name: str) -> float:
+    """Return the first value of an input."""
+    record = job.train.record
+    place = [channel.name for channel in record.inputs].index(name)
+    return float(record.experiments[0].inputs[0, place])

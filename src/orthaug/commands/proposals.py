@@ -159,6 +159,7 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
     found = [
         *late,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
+        *_missing_states(job, result),
         *_missing_terms(job, result),
         *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),
@@ -213,6 +214,18 @@ def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
     moved = f"{plural(abs(late.delay), 'sample')} {'later' if late.delay > 0 else 'earlier'}"
     words = f'{late.input} {moved} (step = "shift" of data.prepare)'
     yield Proposal(words, {"data.prepare": steps}, step=step)
+
+
+def _missing_states(job: Job, result: FitResult) -> Iterator[Proposal]:
+    """Yield the state whose lack the free run's error shows most clearly."""
+    found = result.unexplained
+    names = _new_name(job, "z"), _new_name(job, "T"), _new_name(job)
+    for missing in found.memory if found is not None and found.hidden_state else ():
+        made = job.physics.with_state(job, missing, names)
+        if made is not None:
+            change, words = made
+            yield Proposal(words, change)
+            return
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
