@@ -332,6 +332,7 @@ def test_a_state_that_is_missing_is_tried_as_one(tmp_path):
     first = fitted.result.advice[0]
     assert "the missing state z (dz/dt = (x - z)/T2) in the equation of x" in first.text
     assert first.after < 0.2 * first.before
+    assert "late_rows" not in [warning.code for warning in fitted.result.warnings]
     spec = tmp_path / "spec.toml"
     spec.write_text(tomlkit.dumps(apply_change(tomllib.loads(text), first.change)))
     followed = oa.fit_spec(str(spec))

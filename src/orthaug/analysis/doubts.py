@@ -6,6 +6,7 @@ Every fit is tested, for either kind of physics, with a learner or without one.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -54,6 +55,7 @@ _LEARN = (
     "names them."
 )
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
+_OTHER_CAUSES = {"hidden_state", "late_rows"}  # alike: what explains nearly all refutes the others
 _UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
 _DETERMINED = re.compile(
     r"( The data determine | Of the physical parameters they determine )[^.]*\."
@@ -239,18 +241,21 @@ def _term_of(result: Findings, family: FamilyTest) -> str:
     return f" ({best.expression}, most likely)" if same else ""
 
 
-def with_found_change(fit: Any, result: F, found: str, *, nearly_all: bool = False) -> F:
+def with_found_change(
+    fit: Any, result: F, found: str, *, nearly_all: bool = False, causes: Collection[str] = ()
+) -> F:
     """Return the findings after a change that lowers the error to below a half.
 
     One that took what is left for a disturbance refers to the change instead. Where the change
-    explains nearly all, it is the remedy, and no state is missing.
+    explains nearly all, it is the remedy, and other causes are not.
 
     Args:
         found: the change and its gain, as a sentence.
+        causes: codes of the warnings whose cause the change mends.
     """
     left = _static_share(result)
     if left > _LEFT or result.unexplained is not None or not _is_disturbance(fit, result):
-        return _with_remedy(result, found) if nearly_all else result
+        return _with_remedy(result, found, causes) if nearly_all else result
     only = _ONLY if _has_intervals(result) else ""
     text = (
         f"{_more_than_noise(result)}, and physics that is missing is its likely cause. {found} "
@@ -263,10 +268,11 @@ def with_found_change(fit: Any, result: F, found: str, *, nearly_all: bool = Fal
     return result.changed(warnings=warnings)
 
 
-def _with_remedy(result: F, found: str) -> F:
-    """Return the findings with a change as the remedy, and without a state that is missing."""
+def _with_remedy(result: F, found: str, causes: Collection[str]) -> F:
+    """Return the findings with a change as the remedy, and without causes that it does not mend."""
     done = f"{found} Make that change, and fit again."
-    others = [one for one in result.warnings if one.code != "hidden_state"]
+    refuted = _OTHER_CAUSES - set(causes)
+    others = [one for one in result.warnings if one.code not in refuted]
     warnings = [
         Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
         if one.code == "unexplained"
@@ -274,7 +280,7 @@ def _with_remedy(result: F, found: str) -> F:
         for one in others
     ]
     structure = result.unexplained
-    if structure is not None:
+    if structure is not None and "hidden_state" in refuted:
         structure = structure.model_copy(update={"hidden_state": False})
     return result.changed(warnings=warnings, unexplained=structure)
 

@@ -22,7 +22,7 @@ from orthaug.analysis.examination import Examination, score_and_analyse, was_sto
 from orthaug.commands import job_result
 from orthaug.commands.chosen_rows import after_choice
 from orthaug.commands.folder import PHYSICS
-from orthaug.commands.job import AS_DECLARED, Job, Variant, origin_of
+from orthaug.commands.job import AS_DECLARED, MISSING_STATE, Job, Variant, origin_of
 from orthaug.fitting.estimates import Estimate
 from orthaug.reports.page_verdict import is_biased_by_feedback
 from orthaug.reports.result import FitResult
@@ -100,7 +100,14 @@ def with_advice(fitted: FitReport) -> FitReport:
     looped = is_biased_by_feedback(result)  # what explains most may then be the loop
     if advice and not looped and _explains_more_than(_HALF, advice[0]):
         nearly_all = _explains_more_than(_FIFTH, advice[0])
-        result = with_found_change(fitted.fit, result, advice[0].text, nearly_all=nearly_all)
+        change, causes = advice[0].change, set[str]()
+        if "data.prepare" in change:
+            causes.add("late_rows")
+        if MISSING_STATE in advice[0].text:
+            causes.add("hidden_state")
+        result = with_found_change(
+            fitted.fit, result, advice[0].text, nearly_all=nearly_all, causes=causes
+        )
     trials = {"warnings": [*result.warnings, *failed], "advice": advice, "advice_trials": tried}
     return replace(fitted, result=result.changed(**trials))
 

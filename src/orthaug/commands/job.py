@@ -72,6 +72,7 @@ class Variant:
         return replace(self, fold=fold)
 
 
+MISSING_STATE = "the missing state"  # what a change that adds one begins with
 AS_DECLARED = Variant()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
 from orthaug.analysis.memory import derivative_of
 from orthaug.analysis.suspects import MotionSuspect
-from orthaug.commands.job import Job, JobPhysics, Variant, declared_output
+from orthaug.commands.job import MISSING_STATE, Job, JobPhysics, Variant, declared_output
 from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.record import Record
@@ -202,7 +202,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.parameters.{size}": {"initial": 0.0},
         }
         place = f"in the equation of {missing.equation}"
-        return change, f"the missing state {state} (d{state}/dt = {derivative}) {place}"
+        return change, f"{MISSING_STATE} {state} (d{state}/dt = {derivative}) {place}"
 
     def _rest_of(self, job: Job, missing: MemoryResult) -> float | str:
         """Return the start of a state with memory: a lag begins at its signal, hysteresis at 0."""

@@ -217,10 +217,16 @@ def _delay(job: Job, late: LateInputResult) -> Iterator[Proposal]:
 
 
 def _missing_states(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the state whose lack the free run's error shows most clearly."""
+    """Yield the state whose lack the free run's error shows most clearly.
+
+    A lag of an input that acts late is proposed as that.
+    """
     found = result.unexplained
+    late = {one.input for one in result.residuals.late} if result.residuals is not None else set()
     names = _new_name(job, "z"), _new_name(job, "T"), _new_name(job)
     for missing in found.memory if found is not None and found.hidden_state else ():
+        if missing.kind == "lag" and missing.on in late:
+            return
         made = job.physics.with_state(job, missing, names)
         if made is not None:
             change, words = made
