@@ -35,9 +35,10 @@ _EXCHANGED = 0.1  # of an input, by past outputs: less is rather weak feedback
 # Of an output, by past inputs: what speaks against an effect of an input
 _NO_EFFECT, _ABSENT = 0.01, 0.1  # level, and the share that there is at most
 _JUMP = 8.0  # times the median size of what its own past leaves of an input
-_ROUNDS = 8
-_AFTER = 3  # rows behind a jump, from which level, slope and curvature of what follows are read
-_ENOUGH = 0.4  # of all rows: what must be left without these
+_ROUNDS = 4
+_FEW = 3  # rows from which level, slope and curvature of what follows are read
+_EXACT = 1e-4  # of an input's deviation: what they leave of one that follows no output
+_SMOOTH_ROWS = 0.2  # of all
 _SWITCHES = 8  # of an input of two levels, up and down each
 _UNEVEN = 0.1  # deviation over mean of the lengths between them
 # Of the distance of the values at which it switches up and down: their scatter, and how far the
@@ -296,30 +297,43 @@ def _tested_share(own: Matrix, others: Matrix, target: Vector) -> tuple[Share, f
 
 
 def _usual(own: Matrix, target: Vector) -> np.ndarray:
-    """Return the rows on which an input does not jump, nor has jumped just before.
+    """Return the rows on which an input does not jump.
 
-    Jumps of a reference would hide everything between them. The lags of the rows just behind one
-    straddle it: of an input that moves smoothly between its jumps, such as sunlight between clouds,
-    no linear filter predicts these rows, and their error is spread over all others. Outputs, which
-    have a longer memory, would seem to predict it.
+    Jumps of a reference would hide everything between them.
+
+    The lags of the rows behind a jump straddle it. Where an input moves smoothly between its jumps,
+    as a generator makes it, those rows are left out too: outputs, which have a longer memory, would
+    seem to predict them. An input that follows a measured output is never that smooth.
     """
+    smooth = _smooth(own, target)
+    if smooth.mean() > _SMOOTH_ROWS:
+        return smooth
     base = np.column_stack([np.ones(len(target)), _scale(own)])
     kept = np.ones(len(target), dtype=bool)
     for _ in range(_ROUNDS):
         if kept.sum() < _ROWS_PER_COLUMN * base.shape[1]:
             break
         left = np.abs(target - base @ np.linalg.lstsq(base[kept], target[kept], rcond=1e-10)[0])
-        median = max(float(np.median(left[kept])), _NOTHING * float(target.std()))
-        kept = _settled(left > _JUMP * median)
+        kept = left <= _JUMP * max(float(np.median(left)), _NOTHING * float(target.std()))
     return kept
 
 
-def _settled(jumps: np.ndarray) -> np.ndarray:
-    """Return the rows without a jump and not just behind one, where these are enough."""
-    settled = ~jumps
-    for rows in range(1, _AFTER + 1):
-        settled[rows:] &= ~jumps[:-rows]
-    return settled if settled.sum() > _ENOUGH * len(jumps) else ~jumps
+def _smooth(own: Matrix, target: Vector) -> np.ndarray:
+    """Return the rows without a jump among their last few, if these predict them all but exactly.
+
+    None of the rows where they do not.
+    """
+    few = np.column_stack([target, own[:, : _FEW + 1]])
+    moves = np.abs(np.diff(few, axis=1))
+    calm = (moves <= _JUMP * np.median(moves)).all(axis=1)
+    base = np.column_stack([np.ones(len(target)), own[:, :_FEW]])
+    left = np.full(len(target), np.inf)
+    for _ in range(_ROUNDS):  # what is left are jumps no larger than its usual moves
+        if calm.sum() < _ROWS_PER_COLUMN * base.shape[1]:
+            break
+        left = np.abs(target - base @ np.linalg.lstsq(base[calm], target[calm], rcond=1e-12)[0])
+        calm &= left <= _JUMP * max(float(np.median(left[calm])), _EXACT * float(target.std()))
+    return calm & bool(np.all(left[calm] < _JUMP * _EXACT * target.std()))
 
 
 def _wald(columns: Matrix, target: Vector) -> float:
