@@ -197,19 +197,12 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         own = states[missing.equation][key]
         change: dict[str, Any] = {
             f"motion.states.{missing.equation}.{key}": f"{own} + {size}*{state}",
-            f"motion.states.{state}": {key: derivative, "start": self._rest_of(job, missing)},
+            f"motion.states.{state}": {key: derivative, "start": _rest_of(job, missing)},
             f"motion.parameters.{scale}": {"initial": float(f"{missing.scale:.3g}"), "min": 0},
             f"motion.parameters.{size}": {"initial": 0.0},
         }
         place = f"in the equation of {missing.equation}"
         return change, f"{MISSING_STATE} {state} (d{state}/dt = {derivative}) {place}"
-
-    def _rest_of(self, job: Job, missing: MemoryResult) -> float | str:
-        """Return the start of a state with memory: a lag begins at its signal, hysteresis at 0."""
-        if missing.kind != "lag":
-            return 0.0
-        own = job.declaration["motion"]["states"].get(missing.on)
-        return _first_of(job, missing.on) if own is None else own.get("start", 0.0)
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:
@@ -524,3 +517,11 @@ def _first_of(job: Job, name: str) -> float:
     record = job.train.record
     place = [channel.name for channel in record.inputs].index(name)
     return float(record.experiments[0].inputs[0, place])
+
+
+def _rest_of(job: Job, missing: MemoryResult) -> float | str:
+    """Return the start of a state with memory: a lag begins at its signal, hysteresis at 0."""
+    if missing.kind != "lag":
+        return 0.0
+    own = job.declaration["motion"]["states"].get(missing.on)
+    return _first_of(job, missing.on) if own is None else own.get("start", 0.0)

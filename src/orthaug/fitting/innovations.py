@@ -116,12 +116,11 @@ class InnovationsTask(MotionTask):
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:
         problem, plan = self.problem, self.plan
         plant = replace(problem, motion=problem.motion.plant)
+        count = len(plant.motion.coordinates.initial)  # the gains come after these
         free, begun = train_motion_physics(
             SegmentedMotion.of(plant, plan.bound, plan.criterion, like=plan),
             solver,
-            known=None
-            if self.known is None
-            else self.known[: len(plant.motion.coordinates.initial)],
+            known=None if self.known is None else self.known[:count],
         )
         plan = replace(plan.with_substeps(free.dynamics.substeps), loose=free.loose)
         own = plan.physics_only
