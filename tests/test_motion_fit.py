@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.integrate
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
@@ -368,6 +369,46 @@ def test_too_few_substeps_move_the_parameters_as_a_finer_fit_says() -> None:
     assert (np.abs(found.value - moved) < 0.02 * np.abs(fits[0].std)).all()
     assert found.errors.max() > 0.1 and "substeps = 2 or more" in found.warnings[0].text
     assert finer.errors.max() < 0.1 and not finer.warnings
+
+
+def test_substeps_are_chosen_again_by_what_the_learner_leaves() -> None:
+    """A cubic spring that the learner has to find: physics alone leaves 89 % of the output."""
+    draw, step = np.random.default_rng(3), 0.002
+    force = np.repeat(draw.uniform(-5, 5, 67), 6)[:400]
+
+    def slope(t: float, state: np.ndarray) -> list[float]:
+        x, v = state
+        return [v, 20 * force[min(int(t / step), 399)] - 9000 * x - 8 * v - 3e7 * x**3]
+
+    instants = step * np.arange(400)
+    position = scipy.integrate.solve_ivp(
+        slope, (0, instants[-1]), [0, 0], t_eval=instants, max_step=step / 4
+    ).y[0]
+    noise = 0.01 * position.std() * draw.normal(size=400)
+    record = oa.Record.from_arrays(
+        force, position + noise, sampling_time=step, inputs=["force"], outputs=["x"]
+    )
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", start="x"),
+            oa.State("v", "b*force - k*x - c*v", start="derivative of x", learned=True),
+        ],
+        [oa.Output("x", "x")],
+        [
+            oa.PhysicalParameter(name, value)
+            for name, value in {"b": 15, "k": 12000, "c": 12}.items()
+        ],
+        ["force"],
+    )
+    fit = oa.estimate(
+        record, motion, learner=oa.MLP((5,), inputs=("x",)), criterion=WHOLE, blocks=0
+    )
+    alone = oa.estimate(record, motion, learner=None, criterion=WHOLE)
+    assert (alone.model.form.substeps, fit.model.form.substeps) == (1, 2)
+    c, error = fit.parameters.loc["c", ["value", "std"]]
+    assert abs(c - 8) < 3 * error
+    moved = oa.substep_bias(fit)
+    assert moved is not None and moved.errors.max() < 0.1 and not moved.warnings
 
 
 def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:

@@ -111,6 +111,12 @@ class InnovationsTask(MotionTask):
         own = super().on(record)
         return replace(self, plan=own.plan, physics=None, known=own.known)
 
+    def refined(
+        self, run: FreeRunFit, solver: LevenbergMarquardt, structure: Structure
+    ) -> tuple[MotionTask, FreeRunFit]:
+        """Return the task and its run as they are: a predictor's errors are those of one step."""
+        return self, run
+
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress
     ) -> tuple[SegmentedMotion, FreeRunFit | None]:

@@ -155,6 +155,10 @@ class Task(Protocol):
         """Return one run from the weights `w`; arguments as in `estimate`."""
         ...
 
+    def refined(self, run: Any, solver: Solver, structure: Structure) -> tuple[Task, Any]:
+        """Return the task integrated as finely as a run's errors ask for, and the run on it."""
+        ...
+
     def loss(self, run: Any) -> float:
         """Return the figure that runs are compared by.
 

@@ -9,8 +9,9 @@ from the initial parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from orthaug.fitting.segment_sums import SegmentSums
 from orthaug.fitting.segmented_motion import MotionObjective, SegmentedMotion
 from orthaug.fitting.segmented_problem import FreeRunFit
 from orthaug.fitting.segments import respond
-from orthaug.fitting.simulation_task import SimulationTask, StartPoint
+from orthaug.fitting.simulation_task import NOTICEABLE, SimulationTask, StartPoint
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -63,6 +64,7 @@ _FEWEST = 50  # operations of equations, whose bookkeeping takes as much
 RESTART_ITERATIONS = 30  # from each
 _SEED = 20_261_127
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
+_HARMLESS = 0.5  # standard errors of a parameter
 _LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
 
@@ -91,7 +93,9 @@ def train_motion_physics(
     best = _from_settled_states(own, solver, best)
     best = _from_lost_parameters(own, solver, best)
     spent = {"iterations": best.iterations, "seconds": best.seconds}
-    segmented, best = _fine_enough(segmented, best, solver)
+    own, best = _fine_enough(segmented.physics_only, best, partial(_descend_on, solver))
+    if own.dynamics.substeps != segmented.dynamics.substeps:
+        segmented = segmented.with_substeps(own.dynamics.substeps)
     point = best.end.point
     states = np.asarray(point.states)
     x, _ = segmented.physics_only.trajectory(point.theta, (), states)
@@ -311,11 +315,14 @@ def _squared_errors(
 
 
 def _fine_enough(
-    segmented: SegmentedMotion, free_fit: FreeRunFit, solver: LevenbergMarquardt
+    segmented: SegmentedMotion,
+    free_fit: FreeRunFit,
+    descend: Callable[[SegmentedMotion, FreeRunFit], FreeRunFit | None],
+    enough: float = _FINE,
 ) -> tuple[SegmentedMotion, FreeRunFit]:
-    """Return segments with substeps fine enough for the outputs.
+    """Return segments with substeps fine enough for the outputs, and the run that they lead to.
 
-    Doubling them moves the outputs by less than 1 % of the residual of the physics.
+    Doubling them moves the outputs by less than the share `enough` of what the run leaves.
     """
     motion = segmented.problem.motion
     while (
@@ -324,9 +331,9 @@ def _fine_enough(
         and 2 * segmented.dynamics.substeps <= MOST_SUBSTEPS
     ):
         finer = segmented.with_substeps(2 * segmented.dynamics.substeps)
-        if substep_shift(segmented.physics_only, finer.physics_only, free_fit) <= _FINE:
+        if substep_shift(segmented, finer, free_fit) <= enough:
             break
-        again = _descend_on(finer.physics_only, solver, free_fit)
+        again = descend(finer, free_fit)
         if again is None:
             break
         segmented, free_fit = finer, again
@@ -353,10 +360,15 @@ def substep_shift(
 
 
 def _descend_on(
-    segmented: SegmentedMotion, solver: LevenbergMarquardt, free_fit: FreeRunFit
+    solver: LevenbergMarquardt,
+    segmented: SegmentedMotion,
+    free_fit: FreeRunFit,
+    structure: Structure | None = None,
+    **options: Any,
 ) -> FreeRunFit | None:
-    point = free_fit.end.point
-    again = segmented.descend(segmented.objective(), point.theta, solver, states=point.states)
+    """Return the end of a descent that goes on from that of a run; None where it fails."""
+    point, objective = free_fit.end.point, segmented.objective(structure)
+    again = segmented.descend(objective, point.p, solver, states=point.states, **options)
     return again if again.ending.usable else None
 
 
@@ -469,6 +481,30 @@ class MotionTask(SimulationTask):
         alone = None if self.physics is None else np.asarray(self.physics.end.point.theta)
         fit = conclude_motion(self.plan, structure, learned, alone, briefly=briefly)
         return replace(fit, warnings=(*fit.warnings, *restart_warnings(self.physics)))
+
+    def refined(
+        self, run: FreeRunFit, solver: LevenbergMarquardt, structure: Structure
+    ) -> tuple[MotionTask, FreeRunFit]:
+        """Return the task with substeps fine enough for what a run leaves, and the run gone on.
+
+        What is fine enough for physics alone is too coarse where a learner leaves far less. Steps
+        that cannot move a parameter by half its standard error stay: `|Δθ̂ᵢ| / σᵢ ≤ ‖Δŷ‖ / σ`.
+        """
+        if not self.bound.learns or run.ending is Ending.STOPPED or run.end.linear is None:
+            return self, run
+
+        looking = solver.within_limit.until(NOTICEABLE / self.plan.residuals)
+
+        def go_on(finer: SegmentedMotion, before: FreeRunFit) -> FreeRunFit | None:
+            again = _descend_on(looking, finer, before, structure, ridge=run.end.ridge)
+            return again and again._replace(
+                iterations=before.iterations + again.iterations,
+                seconds=before.seconds + again.seconds,
+            )
+
+        harmless = _HARMLESS / float(np.sqrt(self.plan.observations.sum()))
+        plan, ended = _fine_enough(self.plan, run, go_on, max(_FINE, harmless))
+        return (self, run) if ended is run else (replace(self, plan=plan), ended)
 
     def train_physics_only(
         self, solver: LevenbergMarquardt, structure: Structure, progress: RunProgress

@@ -330,6 +330,12 @@ class OneStepTask(TrainingRows):
         summed = SummedOneStep(self.engine, self.bound, self.rows, hold)
         return solver.drive(summed, jnp.asarray(w), self._no_overlap, samples=samples, **options)
 
+    def refined(
+        self, run: compiled.TrainingRun, solver: Solver, structure: Structure
+    ) -> tuple[OneStepTask, compiled.TrainingRun]:
+        """Return the task and its run as they are: nothing is integrated."""
+        return self, run
+
     def loss(self, run: compiled.TrainingRun) -> float:
         """Return the mean of squared errors of a run, each output in its standard deviation."""
         return self.mean_square(run.normal.loss)

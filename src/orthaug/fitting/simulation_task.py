@@ -32,7 +32,8 @@ from orthaug.inference.covariance import theta_block
 from orthaug.models.learners import Bound, remembers
 
 _LOOKED_AT = 8  # iterates of a run that ended above physics alone
-_NOTICEABLE = 0.1  # of −2 log L: two steps that gain less end a look for more
+NOTICEABLE = 0.1
+"""Of −2 log L: two steps that gain less end a look for more."""
 _CLEARLY = 4.0  # −2 log L for each weight: what more weights must gain
 
 
@@ -199,7 +200,7 @@ class SimulationTask(ABC):
             first = plan.descend(objective, best.p, solver, report, best.states, **kept, **options)
             if not (evidence and self.doubts_evidence) or first.ending is Ending.STOPPED:
                 return self._below_physics(first)
-        looking = solver.within_limit.until(_NOTICEABLE / plan.residuals)
+        looking = solver.within_limit.until(NOTICEABLE / plan.residuals)
         free = plan.descend(objective, best.p, looking, report, best.states, **kept)
         if not _lowers_loss(free, best.loss):
             return self._below_physics(free if first is None else first)
@@ -218,6 +219,12 @@ class SimulationTask(ABC):
             }
             chosen = chosen._replace(**spent, begun_anew=settled is not None)
         return self._below_physics(chosen)
+
+    def refined(
+        self: Task, run: FreeRunFit, solver: LevenbergMarquardt, structure: Structure
+    ) -> tuple[Task, FreeRunFit]:
+        """Return the task and its run as they are: nothing is integrated."""
+        return self, run
 
     def _is_clearly_better(self, one: FreeRunFit, by_evidence: FreeRunFit) -> bool:
         """Return whether a run explains more than its weights would explain of noise.

@@ -180,8 +180,13 @@ def train(
     elif choice.ensemble:
         members = alike
         estimate = task.conclude(structure, _median(task, runs, members, best))
-    else:
+    elif briefly:
         estimate = concluded(best)
+    else:
+        finer, run = task.refined(runs[best], solver, structure)
+        kept = run is runs[best]
+        estimate = concluded(best) if kept else finer.conclude(structure, finer.learned(run))
+        runs[best], losses[best] = run, finer.loss(run)
     scored = choice.scored and held_out is None
     scores = [_cross_validation(task, run) if scored else math.nan for run in runs]
     results = list(zip(starts, runs, losses, errors, scores, strict=True))
