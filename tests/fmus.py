@@ -1,4 +1,4 @@
-"""Functional Mock-up Units that tests make: Model Exchange, compiled by the C compiler.
+"""Functional Mock-up Units that tests make, compiled by the C compiler: Model Exchange or co-simulation.
 
 Values of parameters can be set before initialization only, as the standard has it.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+PARTS = 10  # Euler steps of a step of co-simulation
 CODE = r"""
 #include <complex.h>
 #include <stdlib.h>
@@ -119,17 +120,37 @@ int fmi2GetContinuousStates(void *c, double *x, size_t n)
 { memcpy(x, ((Model *)c)->x, n * sizeof *x); return 0; }
 int fmi2GetNominalsOfContinuousStates(void *c, double *x, size_t n)
 { for (size_t i = 0; i < n; i++) x[i] = 1; return 0; }
+int fmi2DoStep(void *c, double t, double h, int prior)
+{
+    Model *m = c;
+    number k[NX], y[NY];
+    if (!m->ready) return 3;
+    for (int i = 0; i < @parts@; i++) {
+        evaluate(c, 999, 0, k, y);
+        for (int j = 0; j < NX; j++) m->x[j] += h / @parts@ * creal(k[j]);
+        m->time = t + (i + 1) * h / @parts@;
+    }
+    return 0;
+}
 #define UNUSED(name) int name(void *c, void *a, size_t n, void *b) { return 3; }
 UNUSED(fmi2SetDebugLogging) UNUSED(fmi2GetInteger) UNUSED(fmi2GetBoolean) UNUSED(fmi2GetString)
 UNUSED(fmi2SetInteger) UNUSED(fmi2SetBoolean) UNUSED(fmi2SetString) UNUSED(fmi2GetFMUstate)
 UNUSED(fmi2SetFMUstate) UNUSED(fmi2FreeFMUstate) UNUSED(fmi2SerializedFMUstateSize)
 UNUSED(fmi2SerializeFMUstate) UNUSED(fmi2DeSerializeFMUstate)
+UNUSED(fmi2SetRealInputDerivatives) UNUSED(fmi2GetRealOutputDerivatives) UNUSED(fmi2CancelStep)
+UNUSED(fmi2GetStatus) UNUSED(fmi2GetRealStatus) UNUSED(fmi2GetIntegerStatus)
+UNUSED(fmi2GetBooleanStatus) UNUSED(fmi2GetStringStatus)
 """
 CODE_3 = r"""
 #include <stdbool.h>
 void *fmi3InstantiateModelExchange(const char *n, const char *g, const char *r, bool v, bool l,
                                    void *e, void *f)
 { return fmi2Instantiate(n, 0, g, r, f, v, l); }
+void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l, bool e,
+                                  bool early, const unsigned *q, size_t nq, void *i, void *f, void *u)
+{ return fmi2Instantiate(n, 1, g, r, f, v, l); }
+int fmi3DoStep(void *c, double t, double h, bool prior, bool *a, bool *b, bool *d, double *last)
+{ *a = *b = *d = false; *last = t + h; return fmi2DoStep(c, t, h, prior); }
 void fmi3FreeInstance(void *c) { free(c); }
 int fmi3EnterInitializationMode(void *c, bool a, double b, double t, bool d, double e)
 { ((Model *)c)->time = t; return 0; }
@@ -157,7 +178,7 @@ int fmi3SetContinuousStates(void *c, const double *x, size_t n)
 int fmi3GetContinuousStateDerivatives(void *c, double *dx, size_t n)
 { return fmi2GetDerivatives(c, dx, n); }
 UNUSED(fmi3ActivateModelPartition) UNUSED(fmi3CompletedIntegratorStep)
-UNUSED(fmi3DeserializeFMUState) UNUSED(fmi3DoStep) UNUSED(fmi3EnterConfigurationMode)
+UNUSED(fmi3DeserializeFMUState) UNUSED(fmi3EnterConfigurationMode)
 UNUSED(fmi3EnterStepMode) UNUSED(fmi3EvaluateDiscreteStates) UNUSED(fmi3ExitConfigurationMode)
 UNUSED(fmi3FreeFMUState) UNUSED(fmi3GetAdjointDerivative) UNUSED(fmi3GetBinary)
 UNUSED(fmi3GetBoolean) UNUSED(fmi3GetClock) UNUSED(fmi3GetContinuousStates)
@@ -169,7 +190,7 @@ UNUSED(fmi3GetNumberOfEventIndicators) UNUSED(fmi3GetNumberOfVariableDependencie
 UNUSED(fmi3GetOutputDerivatives) UNUSED(fmi3GetShiftDecimal) UNUSED(fmi3GetShiftFraction)
 UNUSED(fmi3GetString) UNUSED(fmi3GetUInt16) UNUSED(fmi3GetUInt32) UNUSED(fmi3GetUInt64)
 UNUSED(fmi3GetUInt8) UNUSED(fmi3GetVariableDependencies) UNUSED(fmi3GetVersion)
-UNUSED(fmi3InstantiateCoSimulation) UNUSED(fmi3InstantiateScheduledExecution)
+UNUSED(fmi3InstantiateScheduledExecution)
 UNUSED(fmi3SerializeFMUState) UNUSED(fmi3SerializedFMUStateSize) UNUSED(fmi3SetBinary)
 UNUSED(fmi3SetBoolean) UNUSED(fmi3SetClock) UNUSED(fmi3SetDebugLogging) UNUSED(fmi3SetFMUState)
 UNUSED(fmi3SetFloat32) UNUSED(fmi3SetInt16) UNUSED(fmi3SetInt32) UNUSED(fmi3SetInt64)
@@ -191,10 +212,12 @@ class Plant:
     equations: str
     units: tuple[str, ...] = ("kg", "N s/m", "N/m", "J/K", "W/K")
 
-    def described(self, *, directional: bool, events: int, version: str, kind: str) -> str:
+    def described(
+        self, *, directional: bool, events: int, version: str, kind: str, listed: bool
+    ) -> str:
         """Return modelDescription.xml."""
         if version == "3.0":
-            return self._described_3(directional=directional, events=events)
+            return self._described_3(directional=directional, events=events, kind=kind)
         lines, order = [], []
 
         def variable(name: str, reference: int, causality: str, change: str, real: str) -> None:
@@ -219,6 +242,7 @@ class Plant:
             f'<Unknown index="{order.index(f"der({name})") + 1}"/>' for name in self.states
         )
         seen = "".join(f'<Unknown index="{order.index(name) + 1}"/>' for name in self.outputs)
+        states = f"<Derivatives>{rates}</Derivatives>" if listed else ""
         units = "".join(f'<Unit name="{unit}"/>' for unit in self.units)
         return (
             '<?xml version="1.0" encoding="UTF-8"?>\n'
@@ -227,11 +251,11 @@ class Plant:
             f'providesDirectionalDerivative="{str(directional).lower()}"/>'
             f"<UnitDefinitions>{units}</UnitDefinitions>"
             f"<ModelVariables>{''.join(lines)}</ModelVariables><ModelStructure>"
-            f"<Outputs>{seen}</Outputs><Derivatives>{rates}</Derivatives></ModelStructure>"
+            f"<Outputs>{seen}</Outputs>{states}</ModelStructure>"
             "</fmiModelDescription>"
         )
 
-    def _described_3(self, *, directional: bool, events: int) -> str:
+    def _described_3(self, *, directional: bool, events: int, kind: str) -> str:
         """Return modelDescription.xml of FMI 3.0."""
         groups = {
             "parameter": (0, self.parameters.items(), "fixed"),
@@ -261,7 +285,7 @@ class Plant:
         return (
             '<?xml version="1.0" encoding="UTF-8"?>\n'
             '<fmiModelDescription fmiVersion="3.0" modelName="plant" instantiationToken="1">'
-            '<ModelExchange modelIdentifier="plant" '
+            f'<{kind} modelIdentifier="plant" '
             f'providesDirectionalDerivatives="{str(directional).lower()}"/>'
             f"<UnitDefinitions>{units}</UnitDefinitions>"
             f"<ModelVariables>{''.join(lines)}</ModelVariables>"
@@ -277,6 +301,7 @@ class Plant:
         version: str = "2.0",
         kind: str = "ModelExchange",
         platform: str = "",
+        listed: bool = True,
     ) -> Path:
         """Write the FMU; skip the test where there is no compiler."""
         fmpy = pytest.importorskip("fmpy", reason="no FMPy")
@@ -291,6 +316,7 @@ class Plant:
             "start_p": ", ".join([*(real.get("start", "0") for real in attributes), "0"]),
             "start_x": ", ".join(map(str, self.states.values())),
             "equations": self.equations,
+            "parts": str(PARTS),
         }.items():
             code = code.replace(f"@{key}@", text)
         sizes = {"NX": self.states, "NP": self.parameters, "NU": self.inputs, "NY": self.outputs}
@@ -300,7 +326,7 @@ class Plant:
         macros = [f"-D{name}={len(group)}" for name, group in sizes.items()]
         subprocess.run([*command, *macros, "-lm"], check=True)
         described = self.described(
-            directional=directional, events=events, version=version, kind=kind
+            directional=directional, events=events, version=version, kind=kind, listed=listed
         )
         with zipfile.ZipFile(file, "w") as archive:
             archive.writestr("modelDescription.xml", described)

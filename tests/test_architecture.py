@@ -63,7 +63,7 @@ CONCEPTS = {
     "_base.host_calls": "the interface of XLA to functions of the host",
     "physics.black_box": "functions of the host, with derivatives",
     "physics.fmu": "a kind of source",
-    "physics.fmu_instances": "the interface FMI, in both versions",
+    "physics.fmu_points": "values of an FMU, with slopes",
     "physics.mechanisms": "a kind of source",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.observer": "the verb `observe`",

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fmus import SPRING, THERMAL, VAN_DER_POL
+from fmus import PARTS, SPRING, THERMAL, VAN_DER_POL
 from test_cli import run
 
 import orthaug as oa
 from orthaug import FMU, InputError, Motion, Output, PhysicalParameter, Record, State
 from orthaug._base import plugins
 from orthaug.physics import consent
-from orthaug.physics.fmu import Evaluation
+from orthaug.physics.fmu_points import Evaluation
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
 
@@ -322,7 +322,7 @@ def test_bad_specs_are_refused_in_words(posed: Path, old: str, new: str, words: 
     ("options", "words"),
     [
         ({"version": "1.0"}, "FMI 1.0; expected 2.0 or 3.0"),
-        ({"kind": "CoSimulation"}, "co-simulation only, which hides its equations"),
+        ({"kind": "CoSimulation", "listed": False}, "lists no states; name in `states`"),
         ({"platform": "other"}, "it has other. Export it for this computer"),
     ],
 )
@@ -330,6 +330,79 @@ def test_fmus_that_cannot_be_used(tmp_path: Path, options: Any, words: str) -> N
     file = VAN_DER_POL.build(tmp_path / "bad.fmu", **options)
     with pytest.raises(InputError, match=words):
         FMU(file=str(file), parameters=("osc.mu",)).build([], ["y"])
+
+
+def in_ten_parts(x: Any, u: Any, p: Any) -> Any:
+    """Return what `SPRING` for co-simulation makes of states in 0.01 s."""
+    m, c, k = p
+    for _ in range(PARTS):
+        x = x + 0.01 / PARTS * np.array([x[1], (u[0] - c * x[1] - k * x[0]) / m])
+    return x
+
+
+@pytest.fixture(scope="module")
+def stepping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("steps")
+    SPRING.build(place / "spring.fmu", kind="CoSimulation")
+    return place
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_step_of_co_simulation_is_a_sample_of_a_discrete_motion(
+    tmp_path: Path, version: str
+) -> None:
+    import jax
+
+    file = SPRING.build(tmp_path / "spring.fmu", kind="CoSimulation", version=version)
+    motion = FMU(file=str(file), parameters=NAMES).build(["force"], ["position"]).sampled(0.01)
+    assert motion.scheme.discrete
+    rng = np.random.default_rng(1)
+    x, u, p = rng.normal(size=(2, 7)), rng.normal(size=(1, 7)), np.array([0.7, 3.0, 50.0])
+    np.testing.assert_allclose(motion.rates(x, u, p, np), in_ten_parts(x, u, p), rtol=1e-14)
+    np.testing.assert_allclose(motion.observed(x, u, p, np), x[:1], rtol=0)
+    point = x[:, 0], u[:, 0], p
+    found = jax.jit(jax.jacfwd(lambda *z: motion.rates(*z, jax.numpy), (0, 1, 2)))(*point)
+    for i, slopes in enumerate(found):
+        for j, column in enumerate(np.asarray(slopes).T):
+            ends = []
+            for sign in (1, -1):
+                moved = [np.array(part) for part in point]
+                moved[i][j] += sign * 1e-5
+                ends.append(in_ten_parts(*moved))
+            np.testing.assert_allclose(column, (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-7)
+
+
+def test_an_fmu_for_co_simulation_is_fitted_and_saved(stepping: Path, tmp_path: Path) -> None:
+    fit = oa.estimate(record(), spring(stepping, substeps=None), learner=None, blocks=0)
+    assert (np.abs(fit.values - [1, 2, 100]) < 3 * fit.parameters["std"]).all()
+    oa.save(fit.model, tmp_path / "model")
+    again = oa.load(tmp_path / "model", run_fmu=True)
+    run = fit.model.simulate(record(rows=50)).trajectories[0].model
+    np.testing.assert_array_equal(again.simulate(record(rows=50)).trajectories[0].model, run)
+
+
+def test_states_that_are_not_all_that_it_remembers_are_refused(
+    stepping: Path, tmp_path: Path
+) -> None:
+    """Of a description without states they are named; the speed alone does not say the rest."""
+    for states, words in (
+        (("v",), "remembers more than v"),
+        (("x", "w"), "no variable 'w'"),
+        (("position", "v"), "state position cannot be set where it begins"),
+    ):
+        source = spring(stepping, states=states, outputs={}, substeps=None)
+        with pytest.raises(oa.InputError, match=words):
+            source.motion(record()).sampled(0.01)
+    SPRING.build(tmp_path / "spring.fmu", kind="CoSimulation", listed=False)
+    named = spring(tmp_path, states=("x", "v"), outputs={}, substeps=None).motion(record())
+    assert named.names_of_states == ("x", "v")
+
+
+def test_a_co_simulation_has_its_own_integrator(stepping: Path, folder: Path) -> None:
+    with pytest.raises(oa.InputError, match="integrates by itself; leave `integrator` out"):
+        spring(stepping, integrator="rk4").motion(record())
+    with pytest.raises(oa.InputError, match="those of its description; leave `states` out"):
+        spring(folder, states=("x", "v")).motion(record())
 
 
 def test_equations_that_depend_on_time_are_refused(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag, parse_named
 from orthaug.data.record import Preparation
 from orthaug.data.regressors import Features
+from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.lagged import LaggedDynamics
@@ -408,6 +409,8 @@ def _rebuild_plant(declared: dict[str, Any], given: Any, path: Path) -> Motion:
             f"{path}: the saved motion has the states {', '.join(s.name for s in states)} and "
             f"the parameters {', '.join(p.name for p in parameters)}; give the same one."
         )
+    if SAMPLING_TIME in kept["constants"]:
+        given = given.sampled(kept["constants"][SAMPLING_TIME])
     return replace(
         given,
         parameters=tuple(parameters),

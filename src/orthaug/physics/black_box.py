@@ -38,6 +38,10 @@ class BlackBox(Protocol):
         """Numbers nx, nu and np of states, inputs and parameters."""
         ...
 
+    def sampled(self, sampling_time: float) -> BlackBox:
+        """Return the map of this time [s] between samples; itself where it is the same for all."""
+        ...
+
     def values(self, z: Matrix) -> Matrix:
         """Return the values (m, size) at points; NaN where it fails."""
         ...
@@ -64,6 +68,10 @@ class Points:
     """
 
     box: BlackBox
+
+    def sampled(self, sampling_time: float) -> Points:
+        """Return the values of the box of this time [s] between samples."""
+        return Points(self.box.sampled(sampling_time))
 
     def __call__(self, x: Any, u: Any, p: Any) -> Any:
         box = self.box

@@ -1,4 +1,4 @@
-"""Instances of an FMU for Model Exchange, by FMPy: FMI 2.0 and 3.0.
+"""Instances of an FMU for Model Exchange or co-simulation, by FMPy: FMI 2.0 and 3.0.
 
 The functions that a run calls at every point are called by their addresses.
 """
@@ -28,7 +28,11 @@ _WARNING = 1  # the last status with which a call has a value
 
 
 class Instance(ABC):
-    """One instance of an FMU, with values of its parameters, in continuous-time mode."""
+    """One instance of an FMU.
+
+    Under Model Exchange it has values of its parameters, in continuous-time mode. For
+    co-simulation it is begun anew for every step.
+    """
 
     version: ClassVar[str]
     """The major version of FMI, with which the names of its functions begin: "fmi2"."""
@@ -39,12 +43,18 @@ class Instance(ABC):
         self._native: dict[str, object] = {}
         self._used = self._running = False
         self._events = description.numberOfEventIndicators > 0
+        self._advances = description.modelExchange is None
+        kind = description.coSimulation if self._advances else description.modelExchange
         self.fmu: Any = self._instantiate(
             guid=description.guid,
-            modelIdentifier=description.modelExchange.modelIdentifier,
+            modelIdentifier=kind.modelIdentifier,
             unzipDirectory=folder,
             instanceName="orthaug",
         )
+        if self._advances:
+            self._reset = self._bound("Reset")
+            self._leave_initialization = self._bound("ExitInitializationMode")
+            return
         self.rates = self._bound(self.rates_name, c_void_p, c_size_t)
         """Write ẋ to an address, of so many states; returns a status."""
         self._place = self._bound("SetContinuousStates", c_void_p, c_size_t)
@@ -90,6 +100,56 @@ class Instance(ABC):
         self._settle()
         self.fmu.enterContinuousTimeMode()
         self._running = True  # from here on, states are set from outside alone
+
+    def advance(
+        self,
+        points: tuple[int, int, int],
+        parameters: tuple[Any, int],
+        moving: Any,
+        times: tuple[float, int, float],
+        asked: Any,
+        place: int,
+    ) -> list[int]:
+        """Write variables after steps of a co-simulation to an address; return where that failed.
+
+        It begins anew at every point, and without steps its start is read.
+
+        Args:
+            points: address of the first, bytes from one to the next, and their number; states come
+                first, then inputs.
+            parameters: value references of the parameters, as an array of C, and the address of
+                their values.
+            moving, asked: value references of states and inputs, and of what is read.
+            times: of the start, number of steps, and s of each.
+            place: where the values go, those of one point behind those of another.
+        """
+        (at, stride, count), (own, values), (start, steps, step) = points, parameters, times
+        width, size, failed = len(own), len(asked), []
+        several = len(moving)
+        for i in range(count):
+            status = self._reset() if self._used else 0
+            self._used = True
+            status = max(status, self._open(start), self.enter(own, width, values))
+            status = max(status, self.enter(moving, several, at), self._enter_initialization(start))
+            status = max(status, self._leave_initialization())
+            for k in range(steps if status <= _WARNING else 0):
+                status = max(status, self._step(start + k * step, step))
+            if max(status, self.read(asked, size, place + 8 * size * i)) > _WARNING:
+                failed.append(i)
+            at += stride
+        return failed
+
+    @abstractmethod
+    def _open(self, time: float) -> int:
+        """Say when a co-simulation starts, before anything is set; return a status."""
+
+    @abstractmethod
+    def _enter_initialization(self, time: float) -> int:
+        """Enter initialization; return a status."""
+
+    @abstractmethod
+    def _step(self, time: float, step: float) -> int:
+        """Advance from a time by s; return a status."""
 
     def visit(
         self,
@@ -164,17 +224,23 @@ class Instance2(Instance):
 
     def __init__(self, description: object, folder: str) -> None:
         super().__init__(description, folder)
+        self._along: Any = None
         three = c_void_p, c_size_t, c_void_p
         self._enter = self._bound("SetReal", *three)
         self._read = self._bound("GetReal", *three)
-        self._update = self._bound("NewDiscreteStates", c_void_p)
-        self._event = _Event()
-        self._along: Any = None
+        if self._advances:
+            own = c_int, c_double, c_double, c_int, c_double
+            self._set_up = self._bound("SetupExperiment", *own)
+            self._initialize = self._bound("EnterInitializationMode")
+            self._advance = self._bound("DoStep", c_double, c_double, c_int)
+        else:
+            self._update = self._bound("NewDiscreteStates", c_void_p)
+            self._event = _Event()
 
     def _instantiate(self, **names: str) -> Any:
         from fmpy import fmi2
 
-        fmu: Any = fmi2.FMU2Model(**names)
+        fmu: Any = (fmi2.FMU2Slave if self._advances else fmi2.FMU2Model)(**names)
         self._callbacks = fmi2.fmi2CallbackFunctions()
         self._callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(lambda *message: None)
         self._callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
@@ -188,6 +254,15 @@ class Instance2(Instance):
             self.fmu.setReal(parameters, values)
         self.fmu.enterInitializationMode()
         self.fmu.exitInitializationMode()
+
+    def _open(self, time: float) -> int:
+        return self._set_up(0, 0.0, time, 0, 0.0)
+
+    def _enter_initialization(self, time: float) -> int:
+        return self._initialize()
+
+    def _step(self, time: float, step: float) -> int:
+        return self._advance(time, step, 1)
 
     def _update_discrete(self) -> tuple[bool, bool]:
         event = self._event
@@ -216,17 +291,22 @@ class Instance3(Instance):
 
     def __init__(self, description: object, folder: str) -> None:
         super().__init__(description, folder)
+        self._along: Any = None
         four = c_void_p, c_size_t, c_void_p, c_size_t
         self._enter = self._bound("SetFloat64", *four)
         self._read = self._bound("GetFloat64", *four)
-        self._update = self._bound("UpdateDiscreteStates", *(c_void_p,) * 6)
         self._flags, self._time = [c_bool() for _ in range(5)], c_double()
-        self._along: Any = None
+        if self._advances:
+            own = c_bool, c_double, c_double, c_bool, c_double
+            self._initialize = self._bound("EnterInitializationMode", *own)
+            self._advance = self._bound("DoStep", c_double, c_double, c_bool, *(c_void_p,) * 4)
+        else:
+            self._update = self._bound("UpdateDiscreteStates", *(c_void_p,) * 6)
 
     def _instantiate(self, **names: str) -> Any:
         from fmpy import fmi3
 
-        fmu: Any = fmi3.FMU3Model(**names)
+        fmu: Any = (fmi3.FMU3Slave if self._advances else fmi3.FMU3Model)(**names)
         fmu.instantiate(logMessage=lambda *message: None)
         return fmu
 
@@ -235,6 +315,17 @@ class Instance3(Instance):
             self.fmu.setFloat64(parameters, values)
         self.fmu.enterInitializationMode(startTime=0.0)
         self.fmu.exitInitializationMode()
+
+    def _open(self, time: float) -> int:
+        return 0
+
+    def _enter_initialization(self, time: float) -> int:
+        return self._initialize(False, 0.0, time, False, 0.0)  # noqa: FBT003  (as of FMI)
+
+    def _step(self, time: float, step: float) -> int:
+        own = (byref(flag) for flag in (*self._flags[:3], self._time))
+        status = self._advance(time, step, True, *own)  # noqa: FBT003
+        return 3 if self._flags[1] or self._flags[2] else status
 
     def _update_discrete(self) -> tuple[bool, bool]:
         if self._update(*(byref(flag) for flag in self._flags), byref(self._time)) > _WARNING:

@@ -492,7 +492,9 @@ class Motion(NotebookView):
         if SAMPLING_TIME in dict(self.constants):
             return self
         return replace(
-            self, constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time)))))
+            self,
+            constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))),
+            functions=self.functions and _sampled(self.functions, float(sampling_time)),
         )
 
     def check_paced(self, record: Record) -> None:
@@ -620,6 +622,17 @@ class Motion(NotebookView):
                 f"{', '.join(given)}; the record has {', '.join(inputs) or 'none'} and "
                 f"{', '.join(outputs)}. Give them in one order."
             )
+
+
+def _sampled(
+    functions: tuple[Callable[..., Any], Callable[..., Any]], sampling_time: float
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return functions, with the time [s] between samples where they have a use for it."""
+    f, h = (
+        function.sampled(sampling_time) if hasattr(function, "sampled") else function
+        for function in functions
+    )
+    return f, h
 
 
 def _order(definitions: Mapping[str, Expression]) -> list[str]:
