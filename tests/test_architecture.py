@@ -61,7 +61,6 @@ CONCEPTS = {
     "analysis.amplitude_dependence": "the nearest linear system over movements of some size",
     "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
-    "physics.black_box": "functions of the host, with derivatives",
     "physics.fmu": "a kind of source",
     "physics.fmu_points": "values of an FMU, with slopes",
     "physics.mechanisms": "a kind of source",
