@@ -425,6 +425,20 @@ def test_findings_in_memory_have_the_gain(alone: Any) -> None:
     assert found.residuals.verdict == "white" and "K[v]" in str(found)
 
 
+def test_an_observer_has_the_noises_that_the_gain_stands_for(alone: Any) -> None:
+    other = record_of(simulate(5))
+    observer = oa.Observer(alone)
+    assert observer.run(other).consistency().consistent
+    (ahead,) = observer.predict(other, horizon=5).trajectories
+    (wanted,) = alone.model.predict(other, 5).trajectories
+    y = other.experiments[0].outputs
+    settled = slice(50, None)  # both begin from states of their own
+    rms = [np.sqrt(np.mean((y - one.model)[settled] ** 2)) for one in (ahead, wanted)]
+    assert rms[0] < 1.02 * rms[1]
+    within = np.abs((y - ahead.model) / ahead.std)[settled] < 1.96
+    assert 0.9 < np.mean(within) < 0.99
+
+
 @pytest.mark.parametrize(
     ("section", "words"),
     [

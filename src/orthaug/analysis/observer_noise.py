@@ -3,7 +3,8 @@
 Noise in the equations moves the state; noise on a sensor does not. The residual shows which
 (`diagnose`): a white one one step ahead is the equation's, R = 0 and Q its covariance; a white one
 of a free run is the sensors', R its covariance, and Q so small that it makes 3 % of the free run's
-variance: that is for a model that is not exact. Otherwise both are there.
+variance: that is for a model that is not exact. Otherwise both are there. Where a motion has the
+gain of a predictor, they are those of which this is Kalman's gain.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.models.kalman import Noise, log_likelihood
 from orthaug.models.model import Model
+from orthaug.physics.innovations import InnovationsModel
 
 _LITTLE, _MOST = 0.03, 0.9  # shares of a free run's variance that disturbances make
 BOTH = ("equation_noise", "unmodelled")  # verdicts on a free run that mean disturbances
@@ -29,6 +31,7 @@ _KEPT_ROWS, _KEPT_STATES = (1000, 30)
 _REACH = 14.0  # of the search, in e-folds
 _STEP = -1.5  # of the search at first, in e-folds
 _LARGE = 1e12
+_LEAST = 1e-3  # share of the innovations that sensors make at least, beside a predictor
 
 
 def by_verdict(model: Model, verdict: str | None = None) -> Noise:
@@ -47,10 +50,56 @@ def by_verdict(model: Model, verdict: str | None = None) -> Noise:
             "the model has no estimate of its noise (few rows, or trained elsewhere); give the "
             "observer `noise=`, such as oa.Noise(state, output) with two covariances."
         )
+    found = _of_gain(model)
+    if found is not None:
+        return found
     verdict, nothing = kept.verdict if verdict is None else verdict, np.zeros_like(kept.noise)
     if not kept.simulated and verdict != "sensor_noise":
         return Noise(np.array(kept.noise), nothing)
     return with_share(model, kept.noise, _MOST if verdict in BOTH else _LITTLE)
+
+
+def _of_gain(model: Model) -> Noise | None:
+    """Return the uncorrelated noises whose steady Kalman gain is nearest to that of a predictor.
+
+    For a gain K the covariance of the states, `P = (A−KC) P (A−KC)ᵀ + Q + K R Kᵀ`, is linear in the
+    diagonals of Q and R. They are the least squares, not negative, of `A P Cᵀ = K S` and
+    `C P Cᵀ + R = S` (Mehra 1970), S the covariance of the innovations.
+
+    None without a predictor, and where it is unstable about the origin.
+    """
+    predictor = model.noise
+    if not isinstance(predictor, InnovationsModel) or predictor.white:
+        return None
+    from scipy import linalg, optimize  # slow to import
+
+    form, numbers, size = model.filtering
+    gain, spread = np.asarray(predictor.gain), np.asarray(model.statistics.noise)
+    a, c, enters, _ = form.linearised(numbers)
+    left = a - gain @ c
+    if not np.abs(np.linalg.eigvals(left)).max() < 1:
+        return None
+    unit = form.unit(spread, size)
+    moves = [enters @ np.outer(q, q) @ enters.T for q in np.sqrt(np.diag(np.diag(unit)))]
+    sensed = [np.outer(r, r) for r in np.sqrt(np.diag(np.diag(spread)))]
+
+    def moments(states: Matrix, outputs: Matrix) -> Vector:
+        p = linalg.solve_discrete_lyapunov(left, states)
+        return weigh(a @ p @ c.T, c @ p @ c.T + outputs)
+
+    def weigh(states: Matrix, outputs: Matrix) -> Vector:
+        scale = np.sqrt(np.diag(spread))
+        unit_of = np.maximum(np.abs(gain) @ scale, 1e-12 * np.maximum(size, 1e-300))
+        parts = (states / np.outer(unit_of, scale), outputs / np.outer(scale, scale))
+        return np.concatenate([part.ravel() for part in parts])
+
+    columns = [moments(q, np.zeros_like(spread)) for q in moves]
+    columns += [moments(gain @ r @ gain.T, r) for r in sensed]
+    wanted = weigh(gain @ spread, spread)
+    shares = optimize.nnls(np.stack(columns, axis=1), wanted)[0]
+    q, r = np.split(shares, [len(moves)])
+    r = np.maximum(r, _LEAST)  # a filter inverts it where a gap leaves nothing else
+    return Noise(np.diag(q * np.diag(unit)), np.diag(r * np.diag(spread)))
 
 
 def _is_known(noise: Matrix | None) -> TypeGuard[Matrix]:
