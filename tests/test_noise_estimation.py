@@ -347,6 +347,15 @@ def test_what_a_noise_model_is_not_for_is_refused(options: Any, words: str) -> N
         oa.estimate(record(0), PHYSICS, **given)
 
 
+def test_orders_beyond_the_rows_are_refused_or_not_tried() -> None:
+    few, fixed = record(0)[:60], oa.ARMA(ar=40, ma=0)
+    with pytest.raises(oa.InputError, match=r"ar = 40 and ma = 0 leave 18 of 58 rows for 4. unkn"):
+        oa.estimate(few, PHYSICS, learner=None, noise=fixed)
+    chosen = oa.ARMA(ar="auto", ma=0, largest=80)
+    fit = oa.estimate(few, PHYSICS, learner=None, noise=chosen)
+    assert fit.status.ok and len(fit.noise[0].coefficients) < 10
+
+
 def test_coefficients_of_a_model_are_named_and_reflected() -> None:
     noise = NoiseModel.of(((1, 0), (0, 2)), [-0.5, -2.5, 1.0])
     assert noise.names(["y", "z"]) == [("y", "ar1"), ("z", "ma1"), ("z", "ma2")]

@@ -252,7 +252,7 @@ class LaggedPlan(FitPlan[Problem]):
         coloured = declared_noise(request.noise)
         if coloured is not None:
             asked = (request.solver, request.structure, criterion, request.engine)
-            check_noise(problem, *asked, ensemble=request.ensemble)
+            check_noise(problem, coloured, *asked, ensemble=request.ensemble)
             return fit_coloured(
                 problem, coloured, fit, request.options(criterion=criterion, noise="white")
             )

@@ -55,6 +55,7 @@ _MANY = 300_000  # entries of the derivatives: with more, orders are chosen with
 
 def check_noise(
     problem: Problem,
+    noise: ARMA,
     solver: Solver,
     structure: Structure,
     criterion: Criterion,
@@ -82,6 +83,28 @@ def check_noise(
         raise InputError("a noise model has no ensemble of learners; leave out `ensemble`.")
     if not problem.baseline.linear:
         raise InputError("a noise model needs physics that is linear in θ; take white noise.")
+    _check_orders(problem, noise)
+
+
+def _check_orders(problem: Problem, noise: ARMA) -> None:
+    """Raise InputError where the rows are too few for the smallest orders that may be chosen."""
+    lengths, theta = problem.lengths, len(problem.baseline.names)
+    if not _supported(noise, lengths, theta):
+        ar, ma = noise.pairs[0]
+        raise InputError(
+            f"`noise`: ar = {ar} and ma = {ma} leave {_counted(ar, lengths)} of {sum(lengths)} "
+            f"rows for {ar + ma + theta} unknowns. Give lower orders, or more rows."
+        )
+
+
+def _supported(noise: ARMA, lengths: Sequence[int], others: int) -> list[tuple[int, int]]:
+    """Return the orders that leave more rows than there are unknowns, `others` beside them."""
+    return [one for one in noise.pairs if _counted(one[0], lengths) > sum(one) + others]
+
+
+def _counted(ar: int, lengths: Sequence[int]) -> int:
+    """Return the rows whose innovations count: the first of a stretch serve as past only."""
+    return sum(max(length - ar, 0) for length in lengths)
 
 
 def fit_coloured(
@@ -333,8 +356,9 @@ def _choose(rows: _Rows, noise: ARMA) -> _Found:
     """
     ny = rows.errors.shape[1]
     if noise.chooses:
-        skip = max(p for p, _ in noise.pairs)
-        each = [_choose_orders(rows.output(o, skip), noise.pairs) for o in range(ny)]
+        pairs = _supported(noise, rows.lengths, len(rows.nothing)) or noise.pairs[:1]
+        skip = max(p for p, _ in pairs)
+        each = [_choose_orders(rows.output(o, skip), pairs) for o in range(ny)]
         orders = tuple(one.noise.orders[0] for one in each)
     else:
         orders = ((noise.ar, noise.ma),) * ny  # type: ignore[assignment]
