@@ -554,6 +554,7 @@ def test_rows_and_columns_are_chosen_as_in_a_spec(fitted):
         (["--rows", "9"], ["--rows: found '9'"]),
         (["--column", "y"], ["--column: found 'y'; expected NAME=COLUMN"]),
         (["--column", "w=u"], ["--column: 'w' is no channel of the model"]),
+        (["--column", "y=other"], ["--column: found y=other, but ", "has no column 'other'"]),
         (["--column", "y=w"], ["no column 'w'"]),
         (
             ["--missing", "skip", "--initial", "zero"],

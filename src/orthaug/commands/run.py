@@ -203,6 +203,12 @@ def open_run(
     if reading.prepare is None:
         check_instants(loaded, data)
     held = measured_outputs(loaded, data, reading)
+    for name, column in reading.columns.items():
+        if name in {c.name for c in loaded.outputs} - {c.name for c in held}:
+            raise InputError(
+                f"--column: found {name}={column}, but {data} has no column '{column}'; give a "
+                "column of the file."
+            )
     if need_outputs or not loaded.inputs or len(held) == len(loaded.outputs):
         held = list(loaded.outputs)
     elif held:
@@ -456,7 +462,8 @@ def observe_outputs(opened: ModelOnData, horizon: int) -> tuple[Response, list[s
     observer = Observer(opened.model)
     response = observer.predict(opened.record, horizon=horizon)
     consistency = observer.run(opened.record).consistency()
-    coloured = opened.model.coloured
+    # Of a motion the observer has the noises that its gain stands for
+    coloured = opened.model.coloured and not opened.model.statistics.simulated
     return response, _of_band(consistency, response, horizon, coloured=coloured)
 
 
