@@ -185,7 +185,17 @@ def test_a_gap_or_a_fall_is_refused(folder, row, instant, words):
     assert done.code == 2 and words in done.err and "run.csv: line" in done.err
 
 
-def test_an_observer_and_models_in_lags_refuse(fit):
+def test_an_observer_steps_from_instant_to_instant(fit):
+    uneven = record()
+    still = oa.Noise(np.zeros((2, 2)), np.array(fit.model.statistics.noise))
+    (ahead,) = oa.Observer(fit, still).predict(uneven, horizon=50).trajectories
+    (free,) = fit.model.simulate(uneven).trajectories
+    later = slice(len(uneven) // 2, None)
+    apart = np.abs(ahead.model - free.model)[later].max()
+    assert apart < 0.5 * np.std(free.errors)
+
+
+def test_models_in_lags_refuse():
     uneven = record()
     with pytest.raises(oa.InputError, match="even instants"):
         oa.estimate(uneven, oa.Baseline.from_terms([oa.Term("a", "y[k-1]")]), learner=None)
