@@ -503,6 +503,15 @@ def test_independent_columns_are_hardly_ever_called_shared():
     assert called == 0
 
 
+def test_a_parameter_of_no_equation_rests_on_no_regressor():
+    """The gain of a controller, whose torque the plant reads as an input."""
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=(300, 1))
+    slopes = np.stack([z + 1e-3 * rng.normal(size=z.shape), np.zeros_like(z)], axis=2)
+    shared = SharedDirections(("damper", "gain"), np.zeros((2, 0)), rest=left_over(slopes, z))
+    assert list(shared.little) == ["damper"]
+
+
 def test_a_motion_asks_the_rows_too():
     """A column that is the sign of the speed beside a learner that sees the speed; and one that is not."""
     rng = np.random.default_rng(1)

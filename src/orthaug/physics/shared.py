@@ -77,12 +77,14 @@ class SharedDirections:
         """Parameters that rest on little of their regressors, with its share of the squares.
 
         What is linear in the features counts as followed by the learner here: exact as that is,
-        the value then is the effect of the signals that only this remainder holds.
+        the value then is the effect of the signals that only this remainder holds. A parameter of
+        a controller alone, which no equation of the plant reads, has no such regressor.
         """
         if self.rest is None:
             return {}
-        left, whole = np.diag(self.rest.left), np.maximum(np.diag(self.rest.whole), 1e-300)
-        shares = zip(self.names, self.basis, left / whole, strict=True)
+        left, whole = np.diag(self.rest.left), np.diag(self.rest.whole)
+        share = np.where(whole > 0, left / np.maximum(whole, 1e-300), 1.0)
+        shares = zip(self.names, self.basis, share, strict=True)
         return {
             name: float(share)
             for name, row, share in shares
