@@ -545,6 +545,10 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
         untested = fit_verdict(motion.result.model_copy(update=seen))
         assert untested.level == "care" and words in untested.trust
         assert "Do not read" in untested.use and "the warning names" in untested.use
+    few = changed | {"residuals": None, "warnings": [Warning("no_degrees_of_freedom", "…")]}
+    empty = fit_verdict(motion.result.model_copy(update=few))
+    assert empty.level == "bad" and empty.trust.startswith("Do not use the model as it is")
+    assert "no more rows than it has unknowns" in empty.trust and empty.use.startswith("Give more")
     train, test = (motion.result.scores[part] for part in ("train", "tests.steps"))
     far = test.simulation.model_copy(
         update={"rmse": [2 * value for value in train.simulation.rmse]}
@@ -561,6 +565,13 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
     assert all(
         sentence.endswith(".") for verdict in (good, ran, told) for sentence in verdict.sentences
     )
+
+
+def test_a_fit_without_degrees_of_freedom_says_so():
+    record = oa.Record.from_arrays([0.1, 0.9, -0.4], [0.0, 0.3, 0.7], inputs=["u"], outputs=["y"])
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+    found = oa.estimate(record, physics, learner=None).diagnose(blocks=0)
+    assert "no_degrees_of_freedom" in [warning.code for warning in found.warnings]
 
 
 def test_the_verdict_of_a_comparison_names_a_model(compared):

@@ -348,7 +348,7 @@ def _warnings(
             f"{len(problem.baseline.names)} parameters and {learned.effective:.1f} effective "
             "weights; use more data or a smaller learner."
         )
-        warnings.append(Warning("no_standard_errors", text))
+        warnings.append(Warning("no_degrees_of_freedom", text))
     if fixed:
         names = ", ".join(f"{problem.baseline.names[i]} = {value:g}" for i, value in fixed.items())
         text = (

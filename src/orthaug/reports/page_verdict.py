@@ -27,6 +27,7 @@ _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error i
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _UNSTABLE = "unstable_plant"
 _RAN_AWAY = "free_run_diverged"
+_NO_FREEDOM = "no_degrees_of_freedom"  # any physics follows so few rows
 _COLOURED = "coloured_residual"  # of the free run of a fit that takes it for white
 # Of models that are as good as each other these are taken first
 _TIED = ("orthogonal", "physics alone")
@@ -56,6 +57,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     unstable = _has_warning(result, _UNSTABLE)  # no score of a free run judges it
     bad = (
         _has_warning(result, _RAN_AWAY)
+        or _has_warning(result, _NO_FREEDOM)
         or (error is not None and error > _POOR and not unstable)
         or _code(result) == "hurts"
     )
@@ -65,7 +67,7 @@ def fit_verdict(result: FitResult) -> PageVerdict:
         "good": "The model is reliable",
         "care": "The model is usable with reservations",
         "bad": "Do not use the model as it is"
-        if use.startswith((_SEARCH_ONLY, _MEND_FIRST))
+        if use.startswith((_SEARCH_ONLY, _MEND_FIRST, _MORE_ROWS))
         else "Do not simulate with the model",
     }[level]
     shown = "" if error is None else f": {_error_text(error, part)}"
@@ -291,6 +293,8 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
         yield f"its free run diverges on {join_words(runaway)}"
+    if _has_warning(result, _NO_FREEDOM):
+        yield "its training data have no more rows than it has unknowns"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
     if (
@@ -392,6 +396,7 @@ def _is_biased(row: ParameterResult) -> bool:
 
 
 _SEARCH_ONLY = "Use it only to search for missing physics"
+_MORE_ROWS = "Give more rows, or physics with fewer parameters, and fit again."
 _MEND_FIRST = "Mend the data first, as the warnings say, and fit again."
 # What is wrong with data looks like missing physics, which a search would then find
 _DEFECTS = (
@@ -433,6 +438,8 @@ def _use_text(result: FitResult, level: str) -> str:
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
     ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
+    if _has_warning(result, _NO_FREEDOM):
+        return _MORE_ROWS
     useless = level == "bad" and (ahead is None or ahead > _POOR or not (known and predicts))
     if useless and any(_has_warning(result, code) for code in _DEFECTS):
         return _MEND_FIRST
@@ -502,6 +509,8 @@ def _next_step(result: FitResult) -> str:
     """
     if result.advice:
         return result.advice[0].text
+    if _has_warning(result, _NO_FREEDOM):
+        return "First record more rows."
     option = _option(result)
     if option is not None:
         return f"An option, not tried here: {option}."
