@@ -883,7 +883,7 @@ BAD = {
     "output": (
         'position = "x"\n',
         'place = "x"\n',
-        "'position'; expected a number, an output (place)",
+        "the motion gives the output 'place', which the data do not have",
     ),
 }
 

@@ -33,7 +33,7 @@ from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.motion import HOLDS, MOST_SUBSTEPS, Motion
 from orthaug.physics.source_kinds import SOURCES
 from orthaug.physics.sources import PhysicsSource
-from orthaug.physics.states import Output, State
+from orthaug.physics.states import Output, State, check_given
 
 if TYPE_CHECKING:
     from orthaug.models.rows import Engine
@@ -399,17 +399,18 @@ class MotionSection(KindSection):
             name: OutputSection(expression=o) if isinstance(o, str) else o
             for name, o in self.outputs.items()
         }
-        known = [
-            *(name for name in outputs if name in given),
-            *(name for name in given if name not in outputs),
-        ]
+        check_given(given, outputs)  # before states, which start from outputs
         states = []
         for name, state in self.states.items():
             equation = state.next if self.discrete else state.derivative
             states.append(State(name, str(equation), state.start, state.learned, state.unit))
         return Motion.from_equations(
             states=states,
-            outputs=[Output(name, given[name].expression, given[name].learned) for name in known],
+            outputs=[
+                Output(name, given[name].expression, given[name].learned)
+                for name in outputs
+                if name in given
+            ],
             parameters=[section.declared(name) for name, section in self.parameters.items()],
             inputs=inputs,
             constants=self.constants,

@@ -38,7 +38,7 @@ from orthaug.physics.parameters import (
     check_not_sampling_time,
     check_parameters,
 )
-from orthaug.physics.states import Origin, Output, State
+from orthaug.physics.states import Origin, Output, State, check_given
 
 HOLDS = ("zero-order", "first-order", "spline")
 MOST_SUBSTEPS = 256
@@ -610,12 +610,7 @@ class Motion(NotebookView):
                     f"the output '{name}' has no expression in the motion; it gives "
                     f"{', '.join(given)}."
                 )
-        for name in given:
-            if name not in outputs:
-                hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}"
-                raise InputError(
-                    f"the motion gives the output '{name}', which the data do not have{hint}."
-                )
+        check_given(given, outputs)
         if tuple(inputs) != self.external or [*outputs] != given:
             raise InputError(
                 f"the motion has the inputs {', '.join(self.external) or 'none'} and the outputs "

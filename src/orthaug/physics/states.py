@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
+
+from orthaug._base.checks import nearest
+from orthaug._base.errors import InputError
 
 _DERIVATIVE = "derivative of "
 
@@ -79,3 +83,13 @@ class Output:
     name: str
     expression: str | None = None
     learned: bool = False
+
+
+def check_given(given: Iterable[str], outputs: Sequence[str]) -> None:
+    """Raise InputError for an output of a motion that is none of the data's."""
+    for name in given:
+        if name not in outputs:
+            hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}"
+            raise InputError(
+                f"the motion gives the output '{name}', which the data do not have{hint}."
+            )
