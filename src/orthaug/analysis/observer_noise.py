@@ -37,7 +37,7 @@ _LEAST = 1e-3  # share of the innovations that sensors make at least, beside a p
 def by_verdict(model: Model, verdict: str | None = None) -> Noise:
     """Return the noises of a fitted model by a verdict, by default the noises that it carries.
 
-    Those are noises by the likelihood of its training data, else those of its verdict.
+    Those are noises by the likelihood of its training data, of its predictor, or of its verdict.
 
     Raises:
         InputError: a model without an estimate of its noise.
