@@ -772,3 +772,23 @@ def test_a_term_with_a_large_gain_of_its_own_is_advised(tmp_path):
     first = fitted.result.advice[0]
     assert "w*abs(w)" in first.text and first.after < 0.3 * first.before
     assert not any("better solution" in one.text for one in fitted.result.advice)
+
+
+def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
+    """A warning said to write the product into the physics; only other terms were tried beside
+    the learner, which gained nothing."""
+    learner = '[learner]\nhidden = [4]\n[training]\nrestarts = 1\n'
+    text = LAGGED.replace('[learner]\nkind = "none"\n', learner)
+
+    def product(k: int, v: float, u: float) -> float:
+        return 0.9 * v + 0.1 * u - 0.05 * u * v
+
+    fitted = oa.fit_spec(str(put(tmp_path, text, driven(product, 500))))
+    shared = [row.name for row in fitted.result.parameters if row.shared]
+    first = fitted.result.advice[0]
+    assert shared == ["a", "b"]
+    assert first.change["learner.kind"] == "none"
+    assert first.change["baseline.terms"][-1]["regressor"] == "v[k-1]*u[k-1]"
+    assert "in place of the learner" in first.text
+    assert "No learner then imitates a and b." in first.text
+    assert first.after < 1.05 * first.before

@@ -13,7 +13,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent
 from orthaug.analysis.attempt import attempt, attempt_warned
 from orthaug.analysis.bias import ResidualStep, bias_table
-from orthaug.analysis.budget import budget_on
+from orthaug.analysis.budget import Budget, budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import physical_rows
@@ -158,7 +158,7 @@ def _of_lagged(
 ) -> dict[str, Any]:
     problem, terms = fit.problem, cache(partial(_terms, fit, evidence))
     suspects = evidence.suspects
-    return {
+    found = {
         **_physical(fit, evidence, warnings),
         "bias": attempt(
             "the bias by suspects",
@@ -187,6 +187,18 @@ def _of_lagged(
             warnings,
         ),
     }
+    found["bias"] = _with_causes(found["bias"], found["budget"])
+    return found
+
+
+def _with_causes(
+    table: list[dict[str, Any]] | None, budget: Budget | None
+) -> list[dict[str, Any]] | None:
+    """Return a table of suspects with the causes in the budget that it lacks."""
+    listed = {entry["name"] for entry in table or ()}
+    causes = [cause.as_dict() for cause in (budget.causes if budget else ())]
+    added = [cause for cause in causes if cause["name"] not in listed]
+    return [*(table or ()), *added] if added else table
 
 
 def _physical(fit: LaggedEstimate, evidence: Evidence, warnings: list[Warning]) -> dict[str, Any]:
@@ -305,6 +317,4 @@ def _biases(
         return None, None
     table = bias_table(terms, suspects)
     budget = budget_on(terms, suspects, table)
-    listed = {entry.suspect for entry in table}
-    usual = [cause for cause in (budget.causes if budget else ()) if cause.suspect not in listed]
-    return [entry.as_dict() for entry in (*table, *usual)] or None, budget
+    return _with_causes([entry.as_dict() for entry in table], budget) or None, budget

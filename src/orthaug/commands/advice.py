@@ -46,7 +46,8 @@ _SAME = 1e-6  # relative: two terms of one error span the same, as a dead zone a
 _FAR_OFF = 8.0  # times the fit's own error: what a refit does not reach is no basis for trials
 _LARGE_GAIN = 3.0  # times the error: what lowers it by more may only have led to other values
 _HALVED = 0.5  # of the error: a gain that slow errors do not give
-_ALIKE = 0.95  # of an error: a step of preparation, which adds no parameter, is named first above
+_ALIKE = 0.95  # of an error: a change that makes a model no larger is named first above
+_AS_GOOD = 1.05  # of the error: up to here a term takes the place of a learner
 _LOOP_FIRST = (
     "First mend the feedback, as its warning says: disturbances that are fed back leave errors "
     "like those of a missing term. "
@@ -269,7 +270,9 @@ def _tried(
         return trials.of(proposal, physics_only=False)
 
     # Where samples are to be mended, what seems missing may come from these: it is tried after them
-    chosen = found[: job.physics.most_trials]
+    replacing = [proposal for proposal in found if proposal.replaces]
+    others = [proposal for proposal in found if not proposal.replaces]
+    chosen = [*replacing, *others[: job.physics.most_trials]]
     runs = iterate_results(errors_of, [Proposal("the spec as it is", {}), *(mending or chosen)])
     base = next(runs).pieces
     if base is None:
@@ -296,7 +299,8 @@ def _tried(
     )
     looped = is_biased_by_feedback(result)
     left = len(found) - len(chosen)
-    return _conclude_trials(base, tried, rows, left, learns, slow=slow, looped=looped)
+    shared = [row.name for row in result.parameters if row.shared]
+    return _conclude_trials(base, tried, rows, left, learns, slow=slow, looped=looped, freed=shared)
 
 
 def _untried(one: Proposal) -> AdviceResult:
@@ -314,10 +318,12 @@ def _conclude_trials(
     *,
     slow: bool,
     looped: bool = False,
+    freed: Sequence[str] = (),
 ) -> tuple[list[AdviceResult], AdviceTrialsResult]:
     """Return the changes that help, and a text on all that were tried.
 
     Args:
+        freed: the parameters that no learner imitates where there is none.
         slow: whether errors remember each other for so long that few of them are independent.
         looped: whether feedback biases the fit, and what it seems to lack with it.
     """
@@ -331,6 +337,7 @@ def _conclude_trials(
         AdviceResult(
             change=one.proposal.change,
             text=_advice_text(one, _before(one, base), rows, looped=looped)
+            + (_freed_text(freed) if one.proposal.replaces else "")
             + (_CHANCE if slow and one is better[0] and _may_be_chance(one, before) else ""),
             before=_before(one, base),
             after=one.error,
@@ -338,13 +345,19 @@ def _conclude_trials(
         for one in better
     ]
     worse = [one for one in tried if one not in helps]
+    as_good = sum(_is_as_good(one, before) for one in helps)
     text = (
         f"Tried by a refit of {'physics and learner' if learns else 'the physics'} and a free "
         f"run over {rows.where}"
     )
     text += (
         f"{rows.which}: {plural(len(tried), 'change')} of the spec, "
-        f"{_relative_clause(len(helps), len(tried))}."
+        f"{_relative_clause(len(helps) - as_good, len(tried))}"
+    )
+    text += (
+        f", and {'which ' if len(tried) == 1 else 'one '}is as good without the learner."
+        if as_good
+        else "."
     )
     if worse:
         named = "; ".join(
@@ -373,6 +386,11 @@ def _relative_clause(better: int, tried: int) -> str:
     )
 
 
+def _is_as_good(one: ProposalErrors, before: float) -> bool:
+    """Return whether a change that helps does not lower the error: it leaves out the learner."""
+    return one.proposal.replaces and one.error >= before
+
+
 def _before(one: ProposalErrors, base: Pieces) -> float:
     """Return the present model's error on the samples on which a change is judged."""
     return math.sqrt(mean_square(base if one.base is None else one.base))
@@ -387,12 +405,15 @@ def _helps(one: ProposalErrors, base: Pieces) -> bool:
     if one.error > _NO_BETTER and (poor or one.error > _TAMED * before):
         return False
     own = base if one.base is None else one.base
+    if one.proposal.replaces and one.error <= _AS_GOOD * before:
+        return _ratio(one, own).code != "hurts"
     return one.proposal.ahead is not None or _ratio(one, own).code == "helps"
 
 
 def _rank(one: ProposalErrors) -> float:
     """Return the error by which changes that help are in order."""
-    return one.error * (1.0 if one.proposal.step is None else _ALIKE)
+    adds_nothing = one.proposal.step is not None or one.proposal.replaces
+    return one.error * (_ALIKE if adds_nothing else 1.0)
 
 
 def _ratio(one: ProposalErrors, base: Pieces) -> Ratio:
@@ -438,9 +459,19 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows, *, lo
             f"{_error(one.error)} after, on {rows.where}. Fit with it first: other causes show "
             "then."
         )
+    if _is_as_good(one, before):
+        return (
+            f"{text} is as good: its error is {_error(one.error)} of the output's deviation, "
+            f"before {_error(before)}."
+        )
     return (
         f"{text} improves from {_error(before)} to {_error(one.error)} of the output's deviation."
     )
+
+
+def _freed_text(names: Sequence[str]) -> str:
+    """Return what a fit without a learner is good for, as a sentence."""
+    return f" No learner then imitates {join_words(names)}." if names else ""
 
 
 def _error_text(one: ProposalErrors, before: float) -> str:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.lines import join_words, plural
+from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
-from orthaug.analysis.findings import LateInputResult
+from orthaug.analysis.findings import LateInputResult, SuspectResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.analysis.wild_rows import wild_row_mendings
 from orthaug.commands.job import Job, declared_output
@@ -53,6 +54,9 @@ class Proposal:
     """Why a free run would not show its effect, as a sentence; empty of what is tried."""
     restarts: bool = False
     """True if it changes initial values alone."""
+    replaces: bool = False
+    """True if a term takes the learner's place: its parameters are then the physics' alone, so that
+    it is advised where it does as well."""
     ahead: tuple[float, float] | None = None
     """What errors' past does not predict of them, without the change and with it, where that shows
     it: beside slow disturbances its gain in a free run is hidden."""
@@ -264,9 +268,24 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
             positive and (size or 0.0) < 0
         ):  # that would be no dead zone
             found.append((share or 0.0, entry, size, positive))
-    for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
+    for share, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
         place, size = entry.equation or entry.output, size or entry.coefficient
-        yield from _term(job, entry.expression, place, size, "", positive=positive)
+        made = list(_term(job, entry.expression, place, size, "", positive=positive))
+        if fit.learns and share >= SURE_SHARE and entry is _most_explaining(result):
+            yield from (_in_place_of_learner(proposal) for proposal in made)
+        yield from made
+
+
+def _most_explaining(result: FitResult) -> SuspectResult | None:
+    """Return the suspect that explains most of the learner."""
+    return max(result.bias or (), key=lambda entry: entry.explained or 0.0, default=None)
+
+
+def _in_place_of_learner(proposal: Proposal) -> Proposal:
+    """Return a proposal that leaves out the learner, too."""
+    words = f"{proposal.words} in place of the learner"
+    change = proposal.change | {"learner.kind": "none"}
+    return replace(proposal, words=words, change=change, replaces=True)
 
 
 def _term(
