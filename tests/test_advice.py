@@ -777,7 +777,7 @@ def test_a_term_with_a_large_gain_of_its_own_is_advised(tmp_path):
 def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
     """A warning said to write the product into the physics; only other terms were tried beside
     the learner, which gained nothing."""
-    learner = '[learner]\nhidden = [4]\n[training]\nrestarts = 1\n'
+    learner = "[learner]\nhidden = [4]\n[training]\nrestarts = 1\n"
     text = LAGGED.replace('[learner]\nkind = "none"\n', learner)
 
     def product(k: int, v: float, u: float) -> float:
@@ -792,3 +792,17 @@ def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
     assert "in place of the learner" in first.text
     assert "No learner then imitates a and b." in first.text
     assert first.after < 1.05 * first.before
+
+
+def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
+    """Errors with a long memory made "as good" something that "may be chance"."""
+    base = [1e-3 * np.random.default_rng(5).uniform(0.5, 1.5, 60)]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+    proposal = Proposal("u**2 in place of the learner", {}, replaces=True)
+    tried = [ProposalErrors(proposal, [1.01 * base[0]])]
+    options: dict[str, Any] = {"slow": True, "freed": ["a", "b"]}
+    (advice,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
+    assert "is as good" in advice.text and "may be chance" not in advice.text
+    assert advice.text.endswith("No learner then imitates a and b.")
+    assert "does not surely improve it, and which is as good without the learner." in trials.text

@@ -436,7 +436,8 @@ def _ratio(one: ProposalErrors, base: Pieces) -> Ratio:
 
 def _may_be_chance(one: ProposalErrors, before: float) -> bool:
     """Return whether a gain is so small that slow errors may give it."""
-    return one.proposal.ahead is None and one.error > _HALVED * before
+    gains = one.proposal.ahead is None and not _is_as_good(one, before)
+    return gains and one.error > _HALVED * before
 
 
 def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows, *, looped: bool) -> str:
