@@ -9,6 +9,7 @@ import pytest
 import scipy.signal as ss
 from test_cli import run, write_csv
 
+import orthaug as oa
 from orthaug import Record
 from orthaug._base.errors import Warning
 from orthaug.analysis.closed_loop import (
@@ -100,6 +101,35 @@ def test_a_controller_is_found(noise, gain):
         "two stages: record the reference" in warning.text
         and "white in the equation" in warning.text
     )
+
+
+def vessel(rng: np.random.Generator, rows: int = 1000) -> tuple[np.ndarray, ...]:
+    """Inflow, valve and level of a vessel under P control with dither, and a slow load."""
+    inflow = np.repeat(rng.uniform(30, 50, rows // 33 + 1), 33)[:rows]
+    level, shown, valve, load = 60.0, np.zeros(rows), np.zeros(rows), 0.0
+    for k in range(rows):
+        if k:
+            load = 0.95 * load + 0.03 * rng.normal()
+            level += 0.05 * inflow[k - 1] - 0.04 * valve[k - 1] + load
+        shown[k] = round(level + 0.05 * rng.normal(), 1)
+        valve[k] = 50 + 4 * (shown[k] - 60) + 2 * rng.normal()
+    return inflow, valve, shown
+
+
+def test_a_filter_of_zero_phase_is_no_preparation_of_a_loop():
+    """With ARMA noise the valve's gain was 11 to 15 % low behind it in four records, else 1 to 7 % off."""
+    inflow, valve, level = vessel(np.random.default_rng(1))
+    record = Record.from_arrays(
+        np.column_stack([inflow, valve]), level, inputs=("q", "valve"), outputs=("y",)
+    )
+    (plain,) = closed_loop(record, "noise")
+    assert "consistent here" in plain.text and "zero phase" not in plain.text
+    filtered = oa.prepare(record, oa.Decimate(2))
+    (warning,) = closed_loop(filtered, "noise")
+    assert "decimate filters with zero phase" in warning.text
+    assert "Fit the data as they are." in warning.text and "consistent" not in warning.text
+    (causal,) = closed_loop(oa.prepare(record, oa.Decimate(2, phase="causal")), "noise")
+    assert "zero phase" not in causal.text
 
 
 @pytest.mark.parametrize("kind", ["white", "slow", "walk", "three levels", "steps with noise"])

@@ -15,6 +15,7 @@ import scipy.io
 import scipy.signal
 from helpers import unfolded
 from test_cli import run
+from test_closed_loop import vessel
 from test_first_orders import crane
 
 import orthaug as oa
@@ -1146,6 +1147,18 @@ def test_rows_far_too_close_are_thinned(tmp_path, every, thinned):
     steps = [one["step"] for one in data.get("prepare", [])]
     assert steps == ["decimate"] * thinned
     assert ("rows are thinned by" in done.out) == thinned
+
+
+def test_under_feedback_rows_are_not_thinned(tmp_path):
+    """The low-pass looks ahead: inputs then answered disturbances that were still to come."""
+    inflow, valve, level = vessel(np.random.default_rng(1))
+    frame = pd.DataFrame({"t": np.arange(1000.0), "q": inflow, "v": valve, "level": level})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    given = ("--inputs", "q,v", "--outputs", "level", "--out", tmp_path / "spec.toml")
+    done = run("init", tmp_path / "a.csv", *given)
+    assert done.code == 0, done.err
+    assert "past outputs predict v" in unfolded(done.out)
+    assert "prepare" not in tomllib.loads((tmp_path / "spec.toml").read_text())["data"]
 
 
 def test_under_feedback_no_input_acts_in_its_own_row(tmp_path):

@@ -14,7 +14,7 @@ import scipy.special
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent
+from orthaug._base.lines import join_words, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.predictability import BlockSums, Share
 from orthaug.data.gaps import complete_record
@@ -158,9 +158,17 @@ def closed_loop(record: Record, method: str = "direct") -> tuple[Warning, ...]:
         for one in found
     )
     outputs = ", ".join(channel.name for channel in record.outputs)
+    ahead = [done.step for done in record.prepared if done.looks_ahead]
+    remedy = (
+        f"{join_words(ahead)} filter{'s' if len(ahead) == 1 else ''} with zero phase: inputs then "
+        "answer disturbances before these occur, which biases θ with any noise model. Fit the "
+        "data as they are."
+        if ahead
+        else _REMEDIES[method]
+    )
     text = (
         f"past {outputs} predict{'s' if len(record.outputs) == 1 else ''} {named}: "
-        f"{_source(found, record)} {_REMEDIES[method]}"
+        f"{_source(found, record)} {remedy}"
     )
     return (Warning("closed_loop", text),)
 

@@ -262,8 +262,9 @@ def draft(found: Survey, roles: Roles, out: Path, system: System | None = None) 
             "inputs."
         )
     whole, measured = model, record
-    if system is None and not missing:
-        roles, record, model = _thinned(found, roles, cut, rows, record, model, direct=not fed)
+    # A low-pass of zero phase lets fed-back inputs answer disturbances before these occur
+    if system is None and not missing and not fed:
+        roles, record, model = _thinned(found, roles, cut, rows, record, model)
     named = (channel_names(roles.inputs), channel_names(roles.outputs))
     wild = (
         f"{plural(lost, 'training row')} in longer gaps or runs of wild samples "
@@ -306,8 +307,6 @@ def _thinned(
     rows: int,
     record: Record,
     model: FirstModel,
-    *,
-    direct: bool,
 ) -> tuple[Roles, Record, FirstModel]:
     """Return the roles, the record and its model with fewer rows where that runs clearly better.
 
@@ -323,7 +322,7 @@ def _thinned(
         fewer = replace(roles, thinned=by)
         with suppress(InputError):
             own = _record(found, fewer, (roles.first, cut), 0)[0]
-            other = first_model(own, direct=direct)
+            other = first_model(own, direct=True)
             if other is None or not record.inputs or (other.restarted and not restarted):
                 continue
             least = float(np.mean(other.free_run))

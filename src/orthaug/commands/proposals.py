@@ -10,7 +10,7 @@ from orthaug._base.lines import join_words, plural
 from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
-from orthaug.analysis.findings import LateInputResult, SuspectResult
+from orthaug.analysis.findings import LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.analysis.wild_rows import wild_row_mendings
 from orthaug.commands.job import Job, declared_output
@@ -154,9 +154,9 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
         and result.residuals.verdict == "white"
         and not result.residuals.changes
     ):
-        return _unique_proposals(
-            list(_suspected_terms(job, result, fit)) if _is_biased(result) else []
-        )
+        biased = _is_biased(result)
+        kinds = (_in_place_of_learner, _suspected_terms) if biased else ()
+        return _unique_proposals([one for kind in kinds for one in kind(job, result, fit)])
     late = list(_late_inputs(job, result))
     if any(proposal.ahead for proposal in late):  # beside it other causes are mistaken
         return _unique_proposals([proposal for proposal in late if proposal.ahead])
@@ -165,6 +165,7 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
         *_missing_states(job, result),
         *_missing_terms(job, result),
+        *_in_place_of_learner(job, result, fit),
         *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),
         *_learner_for_equation(job, result, fit),
@@ -268,24 +269,23 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
             positive and (size or 0.0) < 0
         ):  # that would be no dead zone
             found.append((share or 0.0, entry, size, positive))
-    for share, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
+    for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
         place, size = entry.equation or entry.output, size or entry.coefficient
-        made = list(_term(job, entry.expression, place, size, "", positive=positive))
-        if fit.learns and share >= SURE_SHARE and entry is _most_explaining(result):
-            yield from (_in_place_of_learner(proposal) for proposal in made)
-        yield from made
+        yield from _term(job, entry.expression, place, size, "", positive=positive)
 
 
-def _most_explaining(result: FitResult) -> SuspectResult | None:
-    """Return the suspect that explains most of the learner."""
-    return max(result.bias or (), key=lambda entry: entry.explained or 0.0, default=None)
-
-
-def _in_place_of_learner(proposal: Proposal) -> Proposal:
-    """Return a proposal that leaves out the learner, too."""
-    words = f"{proposal.words} in place of the learner"
-    change = proposal.change | {"learner.kind": "none"}
-    return replace(proposal, words=words, change=change, replaces=True)
+def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator[Proposal]:
+    """Yield the term that explains nearly all of the learner, with no learner beside it."""
+    causes = {row.bias.cause for row in result.parameters if row.bias is not None}
+    for entry in result.bias or () if fit.learns else ():
+        sure = (entry.explained or 0.0) >= SURE_SHARE and entry.memory is None
+        if not sure or entry.name not in causes:
+            continue
+        place, size = entry.equation or entry.output, entry.coefficient_found
+        for term in _term(job, entry.expression, place, size, ""):
+            change = term.change | {"learner.kind": "none"}
+            words = f"{term.words} in place of the learner"
+            yield replace(term, words=words, change=change, replaces=True)
 
 
 def _term(

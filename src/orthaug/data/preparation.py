@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt
 from orthaug._base.checks import Matrix, check_choice, check_type
 from orthaug._base.errors import InputError, Warning, show
 from orthaug._base.registry import OneOf, Registry, check_fields
-from orthaug.data.prepared import Preparation
+from orthaug.data.prepared import FILTERS, Preparation
 from orthaug.data.record import Experiment, Record, same_step, unbroken
 from orthaug.data.steps import (
     Channels,
@@ -185,7 +185,6 @@ STEPS = Registry(
     },
     reserved=("step",),
 )
-_FILTERS = ("lowpass", "highpass", "decimate")
 MENDING = ("outliers", "repeats", "limits", "unwrap", "fill")
 """Steps that leave good samples as they are."""
 SAMPLING = ("decimate", "resample")
@@ -374,7 +373,7 @@ def warnings_of(
     found = []
     for done in prepared:
         channels = done.options.get("channels")
-        if done.step in _FILTERS and channels is not None and set(channels) != set(names):
+        if done.step in FILTERS and channels is not None and set(channels) != set(names):
             found.append(
                 Warning(
                     "filtered_alone",
@@ -383,7 +382,7 @@ def warnings_of(
                     "outputs are filtered alike.",
                 )
             )
-        if done.step not in _FILTERS:
+        if done.step not in FILTERS:
             continue
         late = ", and delays its channels" if done.options.get("phase") == "causal" else ""
         found.append(

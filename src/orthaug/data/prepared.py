@@ -8,6 +8,7 @@ from typing import Any
 
 from orthaug._base.errors import InputError
 
+FILTERS = ("lowpass", "highpass", "decimate")
 _DONE = {
     "outliers": "marked as missing",
     "repeats": "marked as missing",
@@ -34,6 +35,11 @@ class Preparation:
             name: " ".join(v) if isinstance(v, list) else v for name, v in self.options.items()
         }
         return f"{self.step} ({', '.join(f'{name} {value}' for name, value in values.items())})"
+
+    @property
+    def looks_ahead(self) -> bool:
+        """True if the step is a filter of zero phase, whose output depends on later samples."""
+        return self.step in FILTERS and self.options.get("phase", "zero") == "zero"
 
     @property
     def text(self) -> str:
