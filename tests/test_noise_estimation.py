@@ -449,3 +449,16 @@ def test_intervals_hold_with_the_noise_model_and_not_without() -> None:
     assert 0.93 <= np.mean(held) <= 0.97
     assert np.abs(np.mean(off, axis=0)).max() < 0.25  # 1/√200 is 0.07
     assert np.abs(np.mean(plain, axis=0)).max() > 3
+
+
+def test_innovations_that_are_not_white_are_called_so() -> None:
+    """A summary said "white with p = 5.7e-11"."""
+    rng = np.random.default_rng(2)
+    u, e, y = rng.normal(size=600), 0.3 * rng.normal(size=600), np.zeros(600)
+    for k in range(2, 600):
+        y[k] = 0.5 * y[k - 1] + u[k - 1] + e[k] + 0.9 * e[k - 2]
+    record = oa.Record.from_arrays(u, y)
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+    for ma, text in ((1, "not white (p = "), (2, "white with p = ")):
+        fit = oa.estimate(record, physics, noise=oa.ARMA(ar=0, ma=ma))
+        assert f", {text}" in fit.noise[0].text and text in fit.summary()

@@ -54,7 +54,9 @@ class OutputNoise:
         ]
         end = [] if self.std is None else [f"innovations {self.std:.4g}"]
         if self.white_p is not None:
-            end.append(f"white with p = {self.white_p:.2g}")
+            white = self.white_p >= LEVEL
+            p = f"{self.white_p:.2g}"
+            end.append(f"white with p = {p}" if white else f"not white (p = {p})")
         return f"{self.output}: {', '.join([self.model, *each, *end])}"
 
 
