@@ -21,10 +21,9 @@ from orthaug._base.folders import whole_folder
 from orthaug._base.jax import jax
 from orthaug._base.registry import freeze
 from orthaug.data.channels import Channel
-from orthaug.data.expressions import Expression, Lag, parse_named
+from orthaug.data.expressions import SAMPLING_TIME, Expression, Lag, parse_named
 from orthaug.data.record import Preparation
 from orthaug.data.regressors import Features
-from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.models.dynamics import Numbers
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.lagged import LaggedDynamics
