@@ -534,7 +534,7 @@ def test_a_function_s_parameters_start_from_the_physics():
         (
             EULER,
             [Term("theta1", "y[k-1]")],
-            "physics.theta 'theta2' is no parameter of the baseline, did you mean 'theta1'?.",
+            "physics.theta 'theta2' is no parameter of the baseline, did you mean 'theta1'?",
         ),
         (
             {"a": "m", "b": "cd", "c": "ks"},
@@ -639,7 +639,7 @@ REFUSED = [
         [P("mass", 1.0)],
         {"a": "mas"},
         {},
-        "physics.theta 'a' = mas: unknown name 'mas', did you mean 'mass'?.",
+        "physics.theta 'a' = mas: unknown name 'mas', did you mean 'mass'?",
     ),
     (
         [M],
@@ -762,7 +762,7 @@ SOLVES = [
     ),
 ]
 PROFILES = [
-    (dict(name="mm"), "'mm' is no physical parameter, did you mean 'm'?."),
+    (dict(name="mm"), "'mm' is no physical parameter, did you mean 'm'?"),
     (dict(name="stiffness"), "'stiffness' is no physical parameter; known are m, q."),
     (dict(level=1.0), "`level` must be between 0 and 1, such as 0.95; got 1.0."),
     (

@@ -355,9 +355,9 @@ class MotionSuspect:
         known = equations_of(motion)
         if self.equation is not None:
             if self.equation not in known:
-                hint = nearest(self.equation, known) or f"; known are {', '.join(known)}"
+                hint = nearest(self.equation, known) or f"; known are {', '.join(known)}."
                 raise InputError(
-                    f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}."
+                    f"suspect '{self.name}': no equation is that of '{self.equation}'{hint}"
                 )
             return known.index(self.equation)
         likely = usual_places(motion)

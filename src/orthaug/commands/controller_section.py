@@ -162,9 +162,9 @@ def _chosen(name: str | None, channels: Sequence[str], key: str, group: str) -> 
             f"{', '.join(channels) or 'none'}."
         )
     if name not in channels:
-        hint = nearest(name, channels) or f"; its {group} are {', '.join(channels) or 'none'}"
+        hint = nearest(name, channels) or f"; its {group} are {', '.join(channels) or 'none'}."
         raise InputError(
-            f"controller: `{key}` is '{name}', which is none of the {group} of the data{hint}."
+            f"controller: `{key}` is '{name}', which is none of the {group} of the data{hint}"
         )
     return name
 
@@ -179,7 +179,7 @@ def _check_in_equations(
     known = {*section.states, *section.parameters, *section.constants, *section.define, *channels}
     for name in controller.held:
         if name not in words:
-            hint = nearest(name, sorted(words - known)) or "; expected an input of the motion"
+            hint = nearest(name, sorted(words - known)) or "; expected an input of the motion."
             raise InputError(
-                f"controller: its output '{name}' is in no equation of the motion{hint}."
+                f"controller: its output '{name}' is in no equation of the motion{hint}"
             )

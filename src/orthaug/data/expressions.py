@@ -244,11 +244,11 @@ def parse_named(
         )
     for word in re.findall(r"\b[^\W\d]\w*", unicodedata.normalize("NFKC", text)):
         if word not in known and word not in FUNCTIONS and not keyword.iskeyword(word):
-            hint = nearest(word, known) or f"; known are {', '.join(known)}"
+            hint = nearest(word, known) or f"; known are {', '.join(known)}."
             if word == "pi":
-                hint = "; write 3.141592653589793, or give a channel in degrees a `scale`"
+                hint = "; write 3.141592653589793, or give a channel in degrees a `scale`."
             raise InputError(
-                f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}."
+                f"{where} = {text}: unknown name '{word}'{(hints or {}).get(word, hint)}"
             )
     try:
         return parse(text, known)
@@ -433,6 +433,6 @@ def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
         return f"'{text}': {name} is a function; write {name}(…)."
     hint = (
         nearest(name, constants)
-        or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]"
+        or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]."
     )
-    return f"'{text}': unknown constant '{name}'{hint}."
+    return f"'{text}': unknown constant '{name}'{hint}"

@@ -77,8 +77,8 @@ class TermLibrary:
         """
         unknown = [name for name in functions if name not in OF_SIGNALS]
         if unknown:
-            hint = nearest(unknown[0], OF_SIGNALS) or f"; known are {', '.join(OF_SIGNALS)}"
-            raise InputError(f"a library has no terms of the function '{unknown[0]}'{hint}.")
+            hint = nearest(unknown[0], OF_SIGNALS) or f"; known are {', '.join(OF_SIGNALS)}."
+            raise InputError(f"a library has no terms of the function '{unknown[0]}'{hint}")
         signals = tuple(dict.fromkeys(signals))
         made = [
             OF_SIGNALS[name].format(signal)
@@ -161,9 +161,9 @@ class TermLibrary:
         for text in exclude:
             there = by_factors.get(_factors_of(text))
             if there is None:
-                hint = nearest(text, texts) if len(texts) < 1000 else ""
+                hint = (nearest(text, texts) if len(texts) < 1000 else "") or "."
                 raise InputError(
-                    f"`exclude` names the term '{text}', which is not among the terms{hint}."
+                    f"`exclude` names the term '{text}', which is not among the terms{hint}"
                 )
             gone.add(there)
         return self.pick(i for i in range(len(self)) if i not in gone) if gone else self

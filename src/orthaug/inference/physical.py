@@ -399,8 +399,8 @@ def profile(
     """
     _check_freedom(freedom)
     if name not in physics.names:
-        hint = nearest(name, physics.names) or f"; known are {', '.join(physics.names)}"
-        raise InputError(f"'{name}' is no physical parameter{hint}.")
+        hint = nearest(name, physics.names) or f"; known are {', '.join(physics.names)}."
+        raise InputError(f"'{name}' is no physical parameter{hint}")
     if not 0 < level < 1:
         raise InputError(f"`level` must be between 0 and 1, such as 0.95; got {level!r}.")
     fit = _Fit.of(physics, theta_hat, covariance)

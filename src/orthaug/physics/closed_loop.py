@@ -267,9 +267,9 @@ def _check_channels(motion: Motion, controller: Controller, inputs: Sequence[str
     for name in controller.held:
         if name not in motion.inputs:
             hint = nearest(name, motion.inputs) or (
-                f"; its inputs are {', '.join(motion.inputs) or 'none'}"
+                f"; its inputs are {', '.join(motion.inputs) or 'none'}."
             )
-            raise InputError(f"controller: its output '{name}' is no input of the motion{hint}.")
+            raise InputError(f"controller: its output '{name}' is no input of the motion{hint}")
         if name in inputs:
             raise InputError(
                 f"controller: '{name}' is its output and an input of the data. Leave it out of "

@@ -414,7 +414,7 @@ def _parse(
     name: str, text: str, known: Mapping[str, float], parameters: Sequence[str]
 ) -> Expression:
     where = f"physics.theta '{name}'"
-    declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}"}
+    declare = {SAMPLING_TIME: "; give it in `constants`, {'Ts': record.sampling_time}."}
     expression = parse_named(text, known, where, declare)
     if not any(used in parameters for used in expression.names):
         raise InputError(
@@ -467,9 +467,10 @@ def check_baseline(physics: PhysicsMap, baseline: Baseline) -> None:
             )
         if name not in baseline.names:
             hint = (
-                nearest(name, baseline.names) or f"; its parameters are {', '.join(baseline.names)}"
+                nearest(name, baseline.names)
+                or f"; its parameters are {', '.join(baseline.names)}."
             )
-            raise InputError(f"physics.theta '{name}' is no parameter of the baseline{hint}.")
+            raise InputError(f"physics.theta '{name}' is no parameter of the baseline{hint}")
     given = dict(zip(physics.theta_names, physics.initial_theta(), strict=True))
     for name in baseline.names:
         if name not in given:

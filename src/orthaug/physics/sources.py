@@ -252,8 +252,8 @@ class FileSource(PhysicsSource):
         ):
             for name in mapped:
                 if name not in channels:
-                    hint = nearest(name, channels) or f"; there are {', '.join(channels)}"
-                    raise InputError(f"{self.file}: no {what} channel '{name}'{hint}.")
+                    hint = nearest(name, channels) or f"; there are {', '.join(channels)}."
+                    raise InputError(f"{self.file}: no {what} channel '{name}'{hint}")
         entering = [self.find(self.inputs.get(n, n), there.inputs, "input") for n in inputs]
         measured = [self.find(self.outputs.get(n, n), there.outputs, "output") for n in outputs]
         learned = self._learned(there, outputs)

@@ -89,7 +89,7 @@ def check_given(given: Iterable[str], outputs: Sequence[str]) -> None:
     """Raise InputError for an output of a motion that is none of the data's."""
     for name in given:
         if name not in outputs:
-            hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}"
+            hint = nearest(name, outputs) or f"; its outputs are {', '.join(outputs)}."
             raise InputError(
-                f"the motion gives the output '{name}', which the data do not have{hint}."
+                f"the motion gives the output '{name}', which the data do not have{hint}"
             )
