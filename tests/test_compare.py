@@ -153,6 +153,7 @@ def rows_of(folder: Path) -> dict:
     return {row["name"]: row for row in result["comparison"]}
 
 
+@pytest.mark.usefixtures("without_trials")  # whose outcome is in the warnings of a fit
 @pytest.mark.parametrize(
     "kind", ["orthogonal", "additive", "orthogonal-penalty", "baseline-penalty"]
 )

@@ -415,7 +415,7 @@ def test_equations_that_depend_on_time_are_refused(tmp_path: Path) -> None:
 
 def test_fmpy_is_asked_for_in_words(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "fmpy", None)
-    monkeypatch.setattr("orthaug.physics.fmu._UNITS", {})
+    monkeypatch.setattr("orthaug.physics.fmu_units._UNITS", {})
     with pytest.raises(InputError, match=r"pip install 'orthaug\[fmu\]'"):
         spring(folder).describe()
 
