@@ -65,6 +65,7 @@ RESTART_ITERATIONS = 30  # from each
 _SEED = 20_261_127
 _FINE = 0.01  # of the residual: how much the outputs may move when the substeps are doubled
 _HARMLESS = 0.5  # standard errors of a parameter
+_REFINED = 8  # substeps at most beside a learner, or twice those of physics alone
 _LOOSER = 1e-4  # times the weight of the guesses, to see what the outputs determine
 
 
@@ -319,16 +320,18 @@ def _fine_enough(
     free_fit: FreeRunFit,
     descend: Callable[[SegmentedMotion, FreeRunFit], FreeRunFit | None],
     enough: float = _FINE,
+    most: int = MOST_SUBSTEPS,
 ) -> tuple[SegmentedMotion, FreeRunFit]:
     """Return segments with substeps fine enough for the outputs, and the run that they lead to.
 
-    Doubling them moves the outputs by less than the share `enough` of what the run leaves.
+    Doubling them moves the outputs by less than the share `enough` of what the run leaves, or
+    would make them more than `most`.
     """
     motion = segmented.problem.motion
     while (
         motion.substeps is None
         and not motion.scheme.discrete
-        and 2 * segmented.dynamics.substeps <= MOST_SUBSTEPS
+        and 2 * segmented.dynamics.substeps <= most
     ):
         finer = segmented.with_substeps(2 * segmented.dynamics.substeps)
         if substep_shift(segmented, finer, free_fit) <= enough:
@@ -503,7 +506,8 @@ class MotionTask(SimulationTask):
             )
 
         harmless = _HARMLESS / float(np.sqrt(self.plan.observations.sum()))
-        plan, ended = _fine_enough(self.plan, run, go_on, max(_FINE, harmless))
+        most = min(MOST_SUBSTEPS, max(_REFINED, 2 * self.plan.dynamics.substeps))
+        plan, ended = _fine_enough(self.plan, run, go_on, max(_FINE, harmless), most)
         return (self, run) if ended is run else (replace(self, plan=plan), ended)
 
     def train_physics_only(
