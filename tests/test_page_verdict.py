@@ -13,6 +13,7 @@ from orthaug.analysis.findings import (
     AdviceTrialsResult,
     BiasResult,
     DiagnosisResult,
+    MissingResult,
     MotionFitResult,
     ValidationResult,
 )
@@ -278,6 +279,18 @@ def test_what_a_warning_supposes_of_a_parameter_the_verdict_does_not_assert():
         said = fit_verdict(fitted(warnings=[Warning(code=code, text="")]))
         assert said.level == "care" and supposed in said.trust
         assert "as physics yet" in said.use
+
+
+@pytest.mark.parametrize(("p", "share"), [(0.03, 0.9), (0.2, 0.9), (0.03, 0.3)])
+def test_terms_that_may_be_missing_behind_coloured_errors_keep_parameters_from_being_read(p, share):
+    """Few rows do not tell disturbances from missing physics; both colour the error."""
+    missing = MissingResult.model_construct(p=p, freedom=[2, 100], share=share, terms=[])
+    found = told().model_copy(update={"verdict": "equation_noise", "missing": missing})
+    said = fit_verdict(fitted(residuals=found))
+    doubted = p < 0.05 and share > 0.5
+    assert ("explain 90 % of its error (p = 0.03)" in said.trust) == doubted
+    assert ("Do not read a as physics yet" in said.use) == doubted
+    assert ("what the residual still contains" in said.use) == doubted
 
 
 @pytest.mark.parametrize("moved", [0.004, 0.006])

@@ -17,6 +17,7 @@ from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResu
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
+_DOUBTFUL = 0.05  # p of missing terms below which no parameter is read as physics
 _COARSE = 0.5  # standard errors that finer integration may move a parameter
 _SURE = 0.1  # standard error over value up to which a parameter counts as known
 _NAMED = 0.5  # share of the learned part from which its cause is the first advice
@@ -336,6 +337,13 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             yield "its residual could not be tested"
         elif result.residuals.verdict == "equation_noise" and _has_warning(result, _COLOURED):
             yield "its errors are large and correlated with their past"
+    if _may_lack_terms(result):
+        assert result.residuals is not None and result.residuals.missing is not None
+        lacking = result.residuals.missing
+        yield (
+            f"terms that its equations may lack explain {percent(lacking.share or 0.0)} of its "
+            f"error (p = {number(lacking.p or 0.0, 2)})"
+        )
     coarse = _moved_by_integrator(result)
     if coarse:
         yield f"more substeps of its integrator would move {join_words(coarse)}"
@@ -432,7 +440,7 @@ def _use_text(result: FitResult, level: str) -> str:
     rows, coarse = _rows(result), _moved_by_integrator(result)
     sure = [row.name for row in rows if _is_known(row) and row.name not in coarse]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
-    doubted = untested or is_biased_by_feedback(result)
+    doubted = untested or is_biased_by_feedback(result) or _may_lack_terms(result)
     known = sure if _noise_alone(result) and not doubted else []
     shared = [row.name for row in rows if row.shared]
     others = [row.name for row in rows if row.name not in (*sure, *shared)]
@@ -461,7 +469,11 @@ def _use_text(result: FitResult, level: str) -> str:
         cover = "interval does" if len(sure) == 1 else "intervals do"
         text += (
             f". Do not read {join_words(sure)} as physics yet: the {cover} not include what "
-            f"{'the residual still contains' if not _noise_alone(result) else 'the warning names'}"
+            + (
+                "the residual still contains"
+                if not _noise_alone(result) or _may_lack_terms(result)
+                else "the warning names"
+            )
         )
     text += (
         f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
@@ -478,6 +490,17 @@ def _use_text(result: FitResult, level: str) -> str:
                 f"determine {join_words(shared)}, if no physics is missing"
             )
     return f"Use it to {text}."
+
+
+def _may_lack_terms(result: FitResult | RowResult) -> bool:
+    """Return whether terms explain most of a coloured error, which is less than sure.
+
+    Disturbances and missing physics both colour it, and few rows do not tell them apart.
+    """
+    found = result.residuals
+    if found is None or found.verdict != "equation_noise" or found.missing is None:
+        return False
+    return (found.missing.p or 0.0) < _DOUBTFUL and (found.missing.share or 0.0) > _NAMED
 
 
 def _noise_alone(result: FitResult) -> bool:
