@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from ctypes import (
     CFUNCTYPE,
     Structure,
+    addressof,
     byref,
     c_bool,
     c_double,
     c_int,
     c_size_t,
+    c_uint,
     c_void_p,
     cast,
 )
@@ -51,9 +53,9 @@ class Instance(ABC):
             unzipDirectory=folder,
             instanceName="orthaug",
         )
+        self._reset = self._bound("Reset")
+        self._leave_initialization = self._bound("ExitInitializationMode")
         if self._advances:
-            self._reset = self._bound("Reset")
-            self._leave_initialization = self._bound("ExitInitializationMode")
             return
         self.rates = self._bound(self.rates_name, c_void_p, c_size_t)
         """Write ẋ to an address, of so many states; returns a status."""
@@ -63,10 +65,6 @@ class Instance(ABC):
     @abstractmethod
     def _instantiate(self, **names: str) -> Any:
         """Return an instance of FMPy."""
-
-    @abstractmethod
-    def _begin(self, parameters: Sequence[int], values: Sequence[float]) -> None:
-        """Set parameters, and enter and leave initialization."""
 
     @abstractmethod
     def _update_discrete(self) -> tuple[bool, bool]:
@@ -91,12 +89,26 @@ class Instance(ABC):
             place: where they go.
         """
 
-    def initialize(self, parameters: Sequence[int], values: Vector) -> None:
-        """Set parameters, and go to continuous time."""
-        if self._used:
-            self.fmu.reset()
+    def _begin(self, *given: tuple[Any, int], time: float = 0.0) -> int:
+        """Set variables from addresses, enter and leave initialization; return a status."""
+        status = self._reset() if self._used else 0
         self._used, self._running = True, False
-        self._begin(list(parameters), [float(v) for v in values])
+        status = max(status, self._open(time))
+        for references, place in given:
+            if len(references):
+                status = max(status, self.enter(references, len(references), place))
+        return max(status, self._enter_initialization(time), self._leave_initialization())
+
+    def initialize(self, parameters: Sequence[int], values: Vector) -> None:
+        """Set parameters, and go to continuous time.
+
+        Raises:
+            ArithmeticError: the FMU refuses.
+        """
+        own = (c_uint * len(parameters))(*parameters)
+        numbers = (c_double * len(parameters))(*values)
+        if self._begin((own, addressof(numbers))) > _WARNING:
+            raise ArithmeticError("it refuses values of its parameters, or to be initialized")
         self._settle()
         self.fmu.enterContinuousTimeMode()
         self._running = True  # from here on, states are set from outside alone
@@ -123,15 +135,10 @@ class Instance(ABC):
             times: of the start, number of steps, and s of each.
             place: where the values go, those of one point behind those of another.
         """
-        (at, stride, count), (own, values), (start, steps, step) = points, parameters, times
-        width, size, failed = len(own), len(asked), []
-        several = len(moving)
+        (at, stride, count), (start, steps, step) = points, times
+        size, failed = len(asked), []
         for i in range(count):
-            status = self._reset() if self._used else 0
-            self._used = True
-            status = max(status, self._open(start), self.enter(own, width, values))
-            status = max(status, self.enter(moving, several, at), self._enter_initialization(start))
-            status = max(status, self._leave_initialization())
+            status = self._begin(parameters, (moving, at), time=start)
             for k in range(steps if status <= _WARNING else 0):
                 status = max(status, self._step(start + k * step, step))
             if max(status, self.read(asked, size, place + 8 * size * i)) > _WARNING:
@@ -141,7 +148,7 @@ class Instance(ABC):
 
     @abstractmethod
     def _open(self, time: float) -> int:
-        """Say when a co-simulation starts, before anything is set; return a status."""
+        """Say when a simulation starts, before anything is set; return a status."""
 
     @abstractmethod
     def _enter_initialization(self, time: float) -> int:
@@ -228,10 +235,10 @@ class Instance2(Instance):
         three = c_void_p, c_size_t, c_void_p
         self._enter = self._bound("SetReal", *three)
         self._read = self._bound("GetReal", *three)
+        own = c_int, c_double, c_double, c_int, c_double
+        self._set_up = self._bound("SetupExperiment", *own)
+        self._initialize = self._bound("EnterInitializationMode")
         if self._advances:
-            own = c_int, c_double, c_double, c_int, c_double
-            self._set_up = self._bound("SetupExperiment", *own)
-            self._initialize = self._bound("EnterInitializationMode")
             self._advance = self._bound("DoStep", c_double, c_double, c_int)
         else:
             self._update = self._bound("NewDiscreteStates", c_void_p)
@@ -247,13 +254,6 @@ class Instance2(Instance):
         self._callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
         fmu.instantiate(callbacks=self._callbacks)
         return fmu
-
-    def _begin(self, parameters: Sequence[int], values: Sequence[float]) -> None:
-        self.fmu.setupExperiment(startTime=0.0)
-        if parameters:
-            self.fmu.setReal(parameters, values)
-        self.fmu.enterInitializationMode()
-        self.fmu.exitInitializationMode()
 
     def _open(self, time: float) -> int:
         return self._set_up(0, 0.0, time, 0, 0.0)
@@ -296,9 +296,9 @@ class Instance3(Instance):
         self._enter = self._bound("SetFloat64", *four)
         self._read = self._bound("GetFloat64", *four)
         self._flags, self._time = [c_bool() for _ in range(5)], c_double()
+        own = c_bool, c_double, c_double, c_bool, c_double
+        self._initialize = self._bound("EnterInitializationMode", *own)
         if self._advances:
-            own = c_bool, c_double, c_double, c_bool, c_double
-            self._initialize = self._bound("EnterInitializationMode", *own)
             self._advance = self._bound("DoStep", c_double, c_double, c_bool, *(c_void_p,) * 4)
         else:
             self._update = self._bound("UpdateDiscreteStates", *(c_void_p,) * 6)
@@ -309,12 +309,6 @@ class Instance3(Instance):
         fmu: Any = (fmi3.FMU3Slave if self._advances else fmi3.FMU3Model)(**names)
         fmu.instantiate(logMessage=lambda *message: None)
         return fmu
-
-    def _begin(self, parameters: Sequence[int], values: Sequence[float]) -> None:
-        if parameters:
-            self.fmu.setFloat64(parameters, values)
-        self.fmu.enterInitializationMode(startTime=0.0)
-        self.fmu.exitInitializationMode()
 
     def _open(self, time: float) -> int:
         return 0

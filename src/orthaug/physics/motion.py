@@ -491,11 +491,12 @@ class Motion(NotebookView):
         check_sampling_constant(self.constants, sampling_time)
         if SAMPLING_TIME in dict(self.constants):
             return self
-        return replace(
-            self,
-            constants=tuple(sorted((*self.constants, (SAMPLING_TIME, float(sampling_time))))),
-            functions=self.functions and _sampled(self.functions, float(sampling_time)),
-        )
+        step = float(sampling_time)
+        constants = tuple(sorted((*self.constants, (SAMPLING_TIME, step))))
+        if self.functions is None:
+            return replace(self, constants=constants)
+        f, h = self.functions
+        return replace(self, constants=constants, functions=(_sampled(f, step), _sampled(h, step)))
 
     def check_paced(self, record: Record) -> None:
         """Raise InputError unless the motion can step between uneven instants."""
@@ -619,15 +620,9 @@ class Motion(NotebookView):
             )
 
 
-def _sampled(
-    functions: tuple[Callable[..., Any], Callable[..., Any]], sampling_time: float
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return functions, with the time [s] between samples where they have a use for it."""
-    f, h = (
-        function.sampled(sampling_time) if hasattr(function, "sampled") else function
-        for function in functions
-    )
-    return f, h
+def _sampled(function: Any, step: float) -> Callable[..., Any]:
+    """Return a function with the time [s] between samples, if it has a use for it."""
+    return function.sampled(step) if hasattr(function, "sampled") else function
 
 
 def _order(definitions: Mapping[str, Expression]) -> list[str]:
