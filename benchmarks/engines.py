@@ -27,7 +27,7 @@ from orthaug.data.sources import RecordSource, witness
 from orthaug.fitting.normal_equations import Blocks
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.models.cluster import Dask, connect
-from orthaug.models.rows import InMemory
+from orthaug.models.rows import InMemory, Overlap
 from orthaug.models.streaming import Stream
 from orthaug.physics.streamed import StreamedProblem, pose_streamed
 
@@ -98,9 +98,10 @@ def posed(source: Any, engine: Any) -> StreamedProblem:
 
 def a_pass(task: OneStepTask) -> Callable[[], Any]:
     """One linearisation: what an iteration costs."""
-    w = np.asarray(task.bound.init(jax.random.key(0)))
-    blocks = Blocks(task.bound)
-    return lambda: jax.block_until_ready(task.engine.sum(blocks, task.rows, w, task._nothing))
+    w, names = np.asarray(task.bound.init(jax.random.key(0))), task.problem.baseline.names
+    blocks, size = Blocks(task.bound), task.bound.size
+    nothing = Overlap(np.zeros((len(names), size)), np.zeros(len(names)))
+    return lambda: jax.block_until_ready(task.engine.sum(blocks, task.rows, w, nothing))
 
 
 def fastest(work: Callable[[], Any], rounds: int = ROUNDS) -> float:

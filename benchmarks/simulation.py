@@ -35,21 +35,20 @@ def main() -> None:
     problem = pose(record(), baseline, None, ("y[k-1]", "y[k-2]"))
     task = OneStepTask.of(problem, MLP((10,)))
     start = task.bound.init(jax.random.key(0))
-    free_fit = FreeRunTask.of(task, Simulation(segment=512, washout=40))
+    free_run = FreeRunTask.of(task, Simulation(segment=512, washout=40))
+    plan = free_run.plan
     c = problem.projection.solve(problem.whitened_target - task.values(start) / problem.deviation)
-    numbers, states = free_fit.numbers(c, start), jnp.asarray(free_fit.segments.start)
+    numbers, states = plan.numbers(c, start), jnp.asarray(plan.segments.start)
 
     def train(iterations: int) -> None:
         with one_blas_thread():  # as `estimate` trains
-            run = free_fit.run(
+            run = free_run.run(
                 LevenbergMarquardt(iterations, tolerance=0.0), start, Orthogonal(), "evidence"
             )
         assert run.end.iterations == iterations, "training ended early"
 
     plain = median_seconds(
-        lambda: jax.block_until_ready(
-            respond(free_fit.dynamics, numbers, free_fit.segments, states)
-        ),
+        lambda: jax.block_until_ready(respond(plan.dynamics, numbers, plan.segments, states)),
         5 * REPEATS,
     )
     # a run's beginning (one-step training, the first linearisation) is paid once: take the difference of two lengths

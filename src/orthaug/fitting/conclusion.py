@@ -368,7 +368,7 @@ def _warnings(
 
 
 _WINDOWS = (4, 16)  # times (states + 1): rows of a window to predict from
-_TRIED_ROWS = 1000  # on which windows are compared
+_TRIED_ROWS = 256  # at most, on which windows are compared
 
 
 def conclude_motion(
@@ -510,33 +510,22 @@ def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynam
 
 
 def _best_window(model: Model[MotionDynamics], record: Record) -> int:
-    """Return the window of rows that predicts one step ahead best.
-
-    On some of the training data.
-    """
-    longest = max(record.experiments, key=len).rows(0, _TRIED_ROWS)
+    """Return the window of rows that predicts one step ahead best, at some rows of the data."""
+    longest = max(record.experiments, key=len)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
+    tried = [window for window in tried if window == tried[0] or 4 * window <= len(longest)]
+    if len(longest) <= tried[-1]:
+        return tried[0]
+    count = min(_TRIED_ROWS, len(longest) - tried[-1])
+    rows = np.linspace(tried[-1], len(longest) - 1, count).astype(int)
     best, least = tried[0], np.inf
     for window in tried:
-        if best != window and 4 * window > len(longest):
-            break
-        part = replace(record, experiments=(longest,))
-        try:
-            response = _with_window(model, window).predict(part)
-        except InputError:  # not even one window fits
-            break
-        (trajectory,) = response.trajectories
-        assert trajectory.measured is not None
+        starts = EstimatedStates(window, model.starts.loose)
         with np.errstate(all="ignore"):
-            errors = (trajectory.model - trajectory.measured)[
-                tried[-1] if len(longest) > 4 * tried[-1] else window :
-            ]
-            errors = errors[~np.isnan(errors).any(axis=1)] if not record.complete else errors
-            if not len(errors):  # no row is beyond the window
-                break
-            square = float(np.mean(np.sum((errors @ model.weight.T) ** 2, axis=1)))
-        if square < 0.98 * least:  # a longer one only where it is clearly better
-            best, least = window, square
+            errors = starts.errors(model, longest, record, rows) @ model.weight.T
+            squares = np.sum(errors[~np.isnan(errors).any(axis=1)] ** 2, axis=1)
+        if len(squares) and squares.mean() < 0.98 * least:  # longer only where clearly better
+            best, least = window, squares.mean()
     return best
 
 

@@ -381,7 +381,7 @@ def _held_out(
     if not choice.blocks or not choice.compares(task, starts):
         return None
     try:
-        model = _lowest(task, runs, concluded)
+        model = _lowest(task, runs, structure)
         folds = covered_folds(task.problem.record, choice.blocks, task.problem.first_row, model)
     except InputError:  # too few rows to leave some out
         LOG.debug(
@@ -402,13 +402,11 @@ def _held_out(
     return HeldOutErrors(folds.where, labels, pieces[0], tuple(pieces[1:]), note=folds.note)
 
 
-def _lowest(
-    task: Task, runs: Sequence[FinishedRun], concluded: Callable[[int], Estimate]
-) -> Model[Any] | None:
+def _lowest(task: Task, runs: Sequence[FinishedRun], structure: Structure) -> Model[Any] | None:
     """Return the model of the run of the lowest loss; None where none has ended well."""
     losses = [task.loss(run) if run.ending.usable else math.inf for run in runs]
     best = int(np.argmin(losses))
-    fit = concluded(best) if math.isfinite(losses[best]) else None
+    fit = _conclude_briefly(task, structure, runs[best]) if math.isfinite(losses[best]) else None
     return fit.model if fit is not None and fit.status.ok else None
 
 

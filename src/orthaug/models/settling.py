@@ -20,11 +20,11 @@ from orthaug.models.dynamics import Dynamics, Numbers
 # Times the size of a state: the distance of a start from its guess that counts as one error
 LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
-_SHORTEST, _LANES = 64, 16  # steps, and windows side by side
+_SHORTEST, _LANES = 128, 16  # steps, and windows side by side
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
 _FEWEST = 8  # steps where each padded row is a call of the host
-_SETTLED = 1e-10  # relative decrease that is not worth a step
+SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
 class Windows(NamedTuple):
@@ -77,11 +77,12 @@ def settle(
     weight: Matrix,
     loose: Vector,
     iterations: int = 12,
+    enough: float = SETTLED,
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
     """Return the states at the windows' first rows that minimise `‖weight e‖²`, and its value (m,).
 
-    A window ends where a step promises to lower it by less than a 10⁻¹⁰th part: that is a 10⁻⁵th of
-    its own noise.
+    A window ends where a step promises to lower it by less than the part `enough`: of a 10⁻¹⁰th, a
+    state is within a 10⁻⁵th of its own noise.
 
     Args:
         states: where to begin.
@@ -98,7 +99,7 @@ def settle(
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
-            ended = (step * right.T).sum(axis=0) <= _SETTLED * misfit
+            ended = (step * right.T).sum(axis=0) <= enough * misfit
         if ended.all():
             break
         trial = np.where(ended, best, best + step)

@@ -12,6 +12,7 @@ they were measured.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -42,7 +43,9 @@ _PRIOR = 1e-9  # of a state at the first row that the inputs do not show, beside
 FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
-_GUESS_ITERATIONS, _WINDOW_ITERATIONS = 30, 6
+_GUESS_ITERATIONS = 30
+# Iterations of a window, and the decrease that ends it: within 0.0003 of the state's own noise
+_UNTIL = (6, 1e-7)
 _LOST = 4.0  # times the usual misfit: the start of a window may be wrong
 _KNOWN = 1e-9  # times how far a state may be from its guess, where that is known
 
@@ -315,30 +318,66 @@ class EstimatedStates:
             return self._follow(model, experiment, record, horizon)
         # Short recordings have at least one prediction
         window = min(self.window, len(experiment) - horizon)
-        form, numbers, steps = model.form, model.numbers, window + horizon
-        inputs = form.inputs(experiment, record)
-        begins = np.arange(len(inputs) - steps + 1)
-        states, free = self._begin(model, experiment, record, begins)
-        ends = [(form, numbers)]
-        if form.learns:
+        begins = np.arange(len(experiment) - (window + horizon) + 1)
+        ends: list[tuple[Any, Numbers]] = [(model.form, model.numbers)]
+        if model.learns:
             alone = model.physics_only
             ends.append((alone.form, alone.numbers))
+        outputs = self._ahead(model, experiment, record, (window, horizon), begins, ends)
+        nothing = np.zeros_like(outputs[0])
+        return Predicted(window + horizon - 1, Parts(outputs[0], nothing, nothing), outputs[-1])
+
+    def errors(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        rows: Vector,
+    ) -> Matrix:
+        """Return the errors (m, ny) of one-step predictions of some rows, none before a window.
+
+        They are NaN where no output was measured.
+        """
+        window, own = self.window, [(model.form, model.numbers)]
+        (outputs,) = self._ahead(model, experiment, record, (window, 1), rows - window, own)
+        return experiment.outputs[rows] - outputs
+
+    def _ahead(
+        self,
+        model: RecordModel[MotionDynamics],
+        experiment: Experiment,
+        record: Record,
+        rows: tuple[int, int],
+        begins: Vector,
+        ends: Sequence[tuple[Any, Numbers]],
+    ) -> list[Matrix]:
+        """Return predictions (m, ny) of the `ends` from the states of windows.
+
+        Args:
+            rows: of a window, and the horizon behind it.
+            begins: the first rows of windows.
+            ends: forms and numbers of models that run from there.
+        """
+        (window, horizon), form, numbers = rows, model.form, model.numbers
+        steps = window + horizon
+        inputs = form.inputs(experiment, record)
+        states, free = self._begin(model, experiment, record, begins)
         sampled = form.motion.discrete_states  # a controller's states follow from the record
         known = np.array([name in sampled for name in form.motion.names_of_states])
         length, pieces = padded_steps(steps), []  # few horizons have programs of their own
-        for begin in range(0, len(begins), _SIDE_BY_SIDE):
-            chosen = begins[begin : begin + _SIDE_BY_SIDE]
-            padded = np.concatenate([chosen, np.repeat(chosen[-1:], _SIDE_BY_SIDE - len(chosen))])
-            rows = np.minimum(padded[None, :] + np.arange(length)[:, None], len(inputs) - 1)
-            following = np.moveaxis(inputs[rows], -1, 1)
-            target = np.moveaxis(experiment.outputs[rows[:window]], -1, 1)
-            windows = Windows(
-                following[:window], target, np.ones((window, len(padded)), dtype=bool)
-            )
+        for first in range(0, len(begins), _SIDE_BY_SIDE):
+            chosen = begins[first : first + _SIDE_BY_SIDE]
+            more = _SIDE_BY_SIDE - len(chosen)
+            lanes = np.pad(np.arange(first, first + len(chosen)), (0, more), mode="edge")
+            along = begins[lanes][None, :] + np.arange(length)[:, None]
+            along = np.minimum(along, len(inputs) - 1)
+            following = np.moveaxis(inputs[along], -1, 1)
+            target = np.moveaxis(experiment.outputs[along[:window]], -1, 1)
+            windows = Windows(following[:window], target, np.ones((window, len(lanes)), dtype=bool))
             settled = _settle_from_either(
                 form,
                 numbers,
-                (states[padded], free[padded]),
+                (states[lanes], free[lanes]),
                 windows,
                 model.weight,
                 np.where(known, self.loose * _KNOWN, self.loose),
@@ -349,9 +388,7 @@ class EstimatedStates:
                     for end in ends
                 ]
             )
-        outputs, physics = (np.concatenate([piece[i] for piece in pieces]) for i in (0, -1))
-        nothing = np.zeros_like(outputs)
-        return Predicted(window + horizon - 1, Parts(outputs, nothing, nothing), physics)
+        return [np.concatenate(piece) for piece in zip(*pieces, strict=True)]
 
     def _follow(
         self,
@@ -459,11 +496,11 @@ def _settle_from_either(
     can be so wrong that the run from it leaves.
     """
     first, second = begins
-    settled, misfit = settle(form, numbers, first.T, windows, weight, loose, _WINDOW_ITERATIONS)
+    settled, misfit = settle(form, numbers, first.T, windows, weight, loose, *_UNTIL)
     usual = np.median(misfit)
     if not (misfit > _LOST * usual).any():
         return settled
-    again, other = settle(form, numbers, second.T, windows, weight, loose, _WINDOW_ITERATIONS)
+    again, other = settle(form, numbers, second.T, windows, weight, loose, *_UNTIL)
     return np.where(other < misfit, again, settled)
 
 
