@@ -61,15 +61,17 @@ def find_divergence(model: Model, record: Record, largest: float = 1024.0) -> Di
     if factor is None or motion is None or motion.scheme.discrete:
         return Divergence(factor, float(largest))
     own = substeps = model.form.substeps
+    growing = _doubling_factors(float(largest))
     for _ in range(_REFINEMENTS):
         if substeps * _FINER > MOST_SUBSTEPS:
             break
         fine = _with_substeps(model, substeps * _FINER)
-        first = _first_rows(fine, record)
-        if bool(_find_diverging(fine, first, [factor])[0]):
+        diverges = partial(_find_diverging, fine, _first_rows(fine, record))
+        still, *wild = diverges([factor, *growing])
+        if still:
             return _confirmed(coarse, factor, largest, own, substeps)
         substeps *= _FINER
-        changed = divergence_scaling(fine, record, largest)
+        changed = _bracket(growing, wild, diverges)
         if changed is None:
             return _confirmed(coarse, None, largest, own, substeps)
         factor = changed
@@ -119,11 +121,7 @@ def divergence_scaling(model: Model, record: Record, largest: float = 1024.0) ->
         return None
     diverges = partial(_find_diverging, model, _first_rows(model, record))
     growing = _doubling_factors(float(largest))
-    wild = diverges(growing)
-    if not wild.any():
-        return None
-    high = int(np.argmax(wild))
-    return _bisect(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
+    return _bracket(growing, diverges(growing), diverges)
 
 
 def describe_divergence(found: Divergence, driven: bool) -> tuple[str, str]:
@@ -167,6 +165,14 @@ def _doubling_factors(largest: float) -> list[float]:
     while factors[-1] < largest:
         factors.append(min(2 * factors[-1], largest))
     return factors
+
+
+def _bracket(growing: Sequence[float], wild: Sequence[bool], diverges: Diverging) -> float | None:
+    """Return the factor from which a run diverges, by which of the growing ones it does."""
+    if not any(wild):
+        return None
+    high = int(np.argmax(wild))
+    return _bisect(growing[high - 1], growing[high], diverges) if high else _below_one(diverges)
 
 
 def _below_one(diverges: Diverging) -> float:

@@ -511,6 +511,7 @@ def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynam
 
 def _best_window(model: Model[MotionDynamics], record: Record) -> int:
     """Return the window of rows that predicts one step ahead best, at some rows of the data."""
+    assert isinstance(model.starts, EstimatedStates)
     longest = max(record.experiments, key=len)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     tried = [window for window in tried if window == tried[0] or 4 * window <= len(longest)]
@@ -520,7 +521,7 @@ def _best_window(model: Model[MotionDynamics], record: Record) -> int:
     rows = np.linspace(tried[-1], len(longest) - 1, count).astype(int)
     best, least = tried[0], np.inf
     for window in tried:
-        starts = EstimatedStates(window, model.starts.loose)
+        starts = replace(model.starts, window=window)
         with np.errstate(all="ignore"):
             errors = starts.errors(model, longest, record, rows) @ model.weight.T
             squares = np.sum(errors[~np.isnan(errors).any(axis=1)] ** 2, axis=1)
