@@ -167,7 +167,9 @@ def _doubling_factors(largest: float) -> list[float]:
     return factors
 
 
-def _bracket(growing: Sequence[float], wild: Sequence[bool], diverges: Diverging) -> float | None:
+def _bracket(
+    growing: Sequence[float], wild: Sequence[bool] | np.ndarray, diverges: Diverging
+) -> float | None:
     """Return the factor from which a run diverges, by which of the growing ones it does."""
     if not any(wild):
         return None
