@@ -93,6 +93,23 @@ def derivative_of(kind: str, on: str, rate: str | None, state: str, scale: str) 
     }.get(kind)
 
 
+def next_of(kind: str, on: str, following: str | None, state: str, scale: str) -> str | None:
+    """Return a term's internal state after a sample as an expression; None where it has none.
+
+    A lag follows a signal that is held, by the share `1 - exp(-Ts/T)` of what is left; hysteresis
+    follows the change of its signal, as in `derivative_of`.
+
+    Args:
+        following: the signal `on` after the sample; None where that is not known.
+        state, scale: as in `derivative_of`.
+    """
+    if kind == "lag":
+        return f"{state} + (1 - exp(-Ts/{scale}))*({on} - {state})"
+    change = None if following is None else f"({following}) - {on}"
+    moves = derivative_of(kind, on, change, state, scale)
+    return None if moves is None else f"{state} + {moves}"
+
+
 def memory_terms(on: str, values: Vector, sampling_time: float) -> list[MemoryTerm]:
     """Return the terms of every kind on a signal, with their grids of time constants and widths."""
     size = float(np.std(values))

@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
 
 # Errors over the output's deviation: of a run that says nothing, and of one that leaves the output
+_FOLLOWS = (
+    0.5  # of the deviation: the parameters of a fit with a larger error are no start of others
+)
 _NO_BETTER, _RUNS_AWAY = (0.95, 3.0)
 _MUCH_LOWER = 0.9  # of the present error: a gain that asks why it is not sure
 _TAMED = 0.1  # of the error of a run that runs away, above which one still runs away
@@ -122,24 +125,24 @@ class ProposalErrors:
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Fits of changed specs."""
+    """Fits of changed specs, which begin where a fit ended that follows the record."""
 
     job: Job
     rows: ValidationRows
     variant: Variant
     unit: Any
     settled: dict[str, Any]
-    """What the fit has chosen, as a change of the spec: a search would cost most."""
+    """What the fit has found, as a change of the spec: a search would cost most."""
 
     def changed_job(self, change: dict[str, object]) -> Job:
-        """Return the job of a changed spec, with what the fit has chosen.
+        """Return the job of a changed spec, with what the fit has found.
 
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
         return self.job.with_spec(
             spec_model().model_validate(
-                apply_change(self.job.declaration, change | self.settled),
+                apply_change(self.job.declaration, self.settled | change),
                 context={"folder": self.job.path.parent},
             )
         )
@@ -264,7 +267,11 @@ def _tried(
         return None
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
-    trials = Trials(job, rows, variant, fit.problem.deviation, job.physics.settled(fit))
+    own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
+    here, settled = math.sqrt(mean_square(own)), job.physics.settled(fit)
+    if here < _FOLLOWS:
+        settled |= job.physics.with_initials(job, fit)
+    trials = Trials(job, rows, variant, fit.problem.deviation, settled)
 
     def errors_of(proposal: Proposal, _: object) -> ProposalErrors:
         return trials.of(proposal, physics_only=False)
@@ -277,8 +284,7 @@ def _tried(
     base = next(runs).pieces
     if base is None:
         return None
-    own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
-    here, before = math.sqrt(mean_square(own)), math.sqrt(mean_square(base))
+    before = math.sqrt(mean_square(base))
     if before > _FAR_OFF * here:
         share = f"has an error of {before:.3g} of the output's deviation"
         does = "diverges" if math.isinf(before) else share

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
-from orthaug.analysis.memory import derivative_of
+from orthaug.analysis.memory import derivative_of, next_of
 from orthaug.analysis.suspects import MotionSuspect
 from orthaug.commands.job import MISSING_STATE, Job, JobPhysics, Variant, declared_output
 from orthaug.commands.spec import Spec, spec_error
@@ -165,7 +165,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
     ) -> tuple[dict[str, Any], str] | None:
         motion, states = self.motion, job.declaration.get("motion", {}).get("states")
         state = f"{late.input}_late"
-        if not states or motion.functions is not None or motion.scheme.discrete:
+        if not states or motion.functions is not None:
             return None
         if motion.definitions or state in {*self.names_taken(job.spec), *motion.inputs}:
             return None
@@ -174,35 +174,44 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.states.{other}.{key}": word.sub(state, str(entry[key]))
             for other, entry in states.items()
         }
-        first = _first_of(job, late.input)
+        first, moving = (
+            _first_of(job, late.input),
+            self._moving("lag", late.input, None, state, name),
+        )
         change |= {
-            f"motion.states.{state}": {key: f"({late.input} - {state})/{name}", "start": first},
+            f"motion.states.{state}": {key: moving, "start": first},
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
         return change, f"a lag of {late.input} (the state {state}, time constant {name})"
+
+    def _moving(self, kind: str, on: str, moves: str | None, state: str, scale: str) -> str | None:
+        """Return the equation of a state with memory, as the equations of the motion are given."""
+        of = next_of if self.motion.scheme.discrete else derivative_of
+        return of(kind, on, moves, state, scale)
 
     def with_state(
         self, job: Job, missing: MemoryResult, names: tuple[str, str, str]
     ) -> tuple[dict[str, Any], str] | None:
         motion, states = self.motion, job.declaration.get("motion", {}).get("states")
-        if not states or motion.functions is not None or motion.scheme.discrete:
+        if not states or motion.functions is not None:
             return None
         if motion.definitions or missing.equation not in states or missing.scale is None:
             return None
         key, (state, scale, size) = motion.equation_key, names
         moves = str(states[missing.on][key]) if missing.on in states else None
-        derivative = derivative_of(missing.kind, missing.on, moves, state, scale)
-        if derivative is None:
+        moving = self._moving(missing.kind, missing.on, moves, state, scale)
+        if moving is None:
             return None
         own = states[missing.equation][key]
         change: dict[str, Any] = {
             f"motion.states.{missing.equation}.{key}": f"{own} + {size}*{state}",
-            f"motion.states.{state}": {key: derivative, "start": _rest_of(job, missing)},
+            f"motion.states.{state}": {key: moving, "start": _rest_of(job, missing)},
             f"motion.parameters.{scale}": {"initial": float(f"{missing.scale:.3g}"), "min": 0},
             f"motion.parameters.{size}": {"initial": 0.0},
         }
         place = f"in the equation of {missing.equation}"
-        return change, f"{MISSING_STATE} {state} (d{state}/dt = {derivative}) {place}"
+        left = f"{state} after a sample" if motion.scheme.discrete else f"d{state}/dt"
+        return change, f"{MISSING_STATE} {state} ({left} = {moving}) {place}"
 
     def other_holds(self, spec: Spec) -> tuple[str, ...]:
         if not self.motion.driving or self.motion.scheme.discrete:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -160,10 +161,12 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
     late = list(_late_inputs(job, result))
     if any(proposal.ahead for proposal in late):  # beside it other causes are mistaken
         return _unique_proposals([proposal for proposal in late if proposal.ahead])
+    states = list(_missing_states(job, result))
+    first, then = (states, late) if _state_explains_more(result) else (late, states)
     found = [
-        *late,
+        *first,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
-        *_missing_states(job, result),
+        *then,
         *_missing_terms(job, result),
         *_in_place_of_learner(job, result, fit),
         *_suspected_terms(job, result, fit),
@@ -237,6 +240,17 @@ def _missing_states(job: Job, result: FitResult) -> Iterator[Proposal]:
             change, words = made
             yield Proposal(words, change)
             return
+
+
+def _state_explains_more(result: FitResult) -> bool:
+    """Return whether a missing state explains more of the free run's error than a late input."""
+    memory = result.unexplained.memory if result.unexplained is not None else []
+    late = result.residuals.late if result.residuals is not None else []
+    left = [
+        min(float(one.delayed or 0.0), float(one.lagged or 0.0)) / float(one.declared or math.inf)
+        for one in late
+    ]
+    return bool(memory) and 1 - float(memory[0].share or 0.0) < min(left, default=math.inf) ** 2
 
 
 def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
