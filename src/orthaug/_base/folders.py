@@ -172,7 +172,8 @@ def check_replaceable(folder: Path, *, force: bool = False) -> None:
         raise OutputError(f"{folder}: cannot be written ({error.strerror}).") from None
     if mine is not None:
         raise OutputError(
-            f"{folder}: holds {mine}; give another folder, or replace all of it with --force."
+            f"{folder}: holds {mine}; give another folder, or replace all of it with --force (in "
+            "Python: force=True)."
         )
     if there:
         _check_parts_writable(folder)
@@ -275,7 +276,10 @@ def check_new_file(path: Path, *, force: bool = False) -> None:
         if path.is_dir() or not path.name:
             raise OutputError(f"{path}: is a folder; expected the name of a file.")
         if path.is_file() and not force:
-            raise OutputError(f"{path}: exists; give another name, or replace it with --force.")
+            raise OutputError(
+                f"{path}: exists; give another name, or replace it with --force (in Python: "
+                "force=True)."
+            )
         if path.exists():
             return
         target = Path(os.path.realpath(path))
@@ -329,7 +333,7 @@ def whole_file(path: Path, *, force: bool = False, result: bool = True) -> Itera
     except FileExistsError:
         text = (
             f"{path}: exists and holds something else; give another name, or replace it with "
-            "--force."
+            "--force (in Python: force=True)."
         )
         raise OutputError(text) from None
     except OSError as error:
