@@ -144,6 +144,7 @@ def test_a_rate_per_minute_is_refused_where_time_was_converted_to_seconds():
         estimate(record, cooled(), learner=None)
     with pytest.raises(InputError, match=r"'a' has the unit min.*\(6\).* in s"):
         estimate(record, cooled(unit="min"), learner=None)
+    assert estimate(record, cooled(unit="H"), learner=None).status.ok  # the henry is no hour
     fit = estimate(record, cooled(equation="b*u/60 - a/60*x"), learner=None)
     assert fit.parameters.loc["a", "value"] == pytest.approx(0.2, rel=0.02)
 

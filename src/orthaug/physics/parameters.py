@@ -115,7 +115,9 @@ def check_time_units(motion: Any, column: str | None) -> tuple[str, ...]:
     for one in (one for one in motion.parameters if one.name in read):
         unit = one.unit.replace(" ", "")
         rate = unit.startswith("1/")
-        factor = unit_of_time(f"x [{unit[2 * rate :]}]")[1] if unit else None
+        name = unit[2 * rate :]
+        is_of_time = len(name) > 2 or name == name.lower()  # H is the henry, and h the hour
+        factor = unit_of_time(f"x [{name}]")[1] if unit and is_of_time else None
         if factor is None and _OTHER_TIME.search(unit):
             found.append(one.name)
         elif factor is not None and factor != 1.0:
