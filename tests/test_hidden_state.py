@@ -114,6 +114,20 @@ def test_a_fall_back_says_that_a_state_is_missing(tmp_path):
     assert not re.search(r"[Tt]he fit determines", text)
 
 
+def test_a_learner_that_was_dropped_is_no_remedy():
+    data = lags(rows=300, hidden=0.2, seed=1)
+    record = oa.Record.from_arrays(data["u"], data["y"], sampling_time=TS)
+    texts = {"a1": "y[k-1]", "a2": "y[k-2]", "b": "u[k-1]"}
+    baseline = oa.Baseline.from_terms([oa.Term(name, text) for name, text in texts.items()])
+    fit = oa.estimate(
+        record, baseline, learner=oa.MLP((8,), inputs=("u[k-1]",)), criterion=oa.Auto()
+    )
+    text = {one.code: one.text for one in fit.diagnose(blocks=0).warnings}
+    assert "physics_alone" in text
+    assert "The learner that was tried does not explain it" in text["unexplained"]
+    assert "Fit with a learner" not in text["unexplained"]
+
+
 def test_lagged_physics_without_a_learner_says_so(tmp_path):
     result, text, _ = fitted(tmp_path, LAGGED, lags())
     assert {"unexplained", "hidden_state"} <= codes(result)
@@ -140,6 +154,31 @@ def test_noise_alone_is_no_hidden_state(tmp_path, physics, data):
         and "unexplained" not in result
     )
     assert "noise only" not in text
+
+
+@pytest.mark.parametrize("seed", [3, 16])
+def test_noise_in_equations_with_products_is_no_hidden_state(seed):
+    """A boost converter: current and voltage have noise whose colour changes with the duty."""
+    random, rows = np.random.default_rng(seed), 400
+    duty = np.repeat(random.uniform(0.3, 0.6, rows // 25 + 1), 25)[:rows]
+    i, v = np.zeros(rows), np.full(rows, 20.0)
+    for k in range(1, rows):
+        off = 1 - duty[k - 1]
+        i[k] = 0.97 * i[k - 1] + 0.2 * (12 - off * v[k - 1]) + 0.02 * random.normal()
+        v[k] = v[k - 1] + 0.04 * (off * i[k - 1] - 0.1 * v[k - 1]) + 0.005 * random.normal()
+    record = oa.Record.from_arrays(
+        duty, np.c_[i, v], sampling_time=1.0, inputs=["d"], outputs=["i", "v"]
+    )
+    terms = [
+        oa.Term("a", "i[k-1]", output="i"),
+        oa.Term("b", "12 - (1 - d[k-1])*v[k-1]", output="i"),
+        oa.Term("e", "v[k-1]", output="v"),
+        oa.Term("c", "(1 - d[k-1])*i[k-1]", output="v"),
+    ]
+    baseline = oa.Baseline.from_terms(terms)
+    found = oa.estimate(record, baseline, learner=None, criterion=oa.Prediction()).diagnose()
+    assert found.unexplained is None
+    assert not {"unexplained", "hidden_state"} & {warning.code for warning in found.warnings}
 
 
 def test_a_base_that_blocks_do_not_determine_makes_no_family_look_good():

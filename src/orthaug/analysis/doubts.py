@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from dataclasses import replace
+from functools import reduce
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,6 +21,7 @@ from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
+from orthaug.inference.nearly_shared import output_warnings
 from orthaug.physics.problem import Problem
 
 if TYPE_CHECKING:
@@ -54,6 +56,11 @@ _LEARN = (
     "Fit with a learner that sees what the missing terms may depend on; `orthaug explain` then "
     "names them."
 )
+_ELSEWHERE = (
+    "The learner that was tried does not explain it: let it see other signals, or add it to other "
+    "equations or outputs; or search for missing terms and states with `[[suspects]]`."
+)
+_REMEDIES = (_SEARCH, _LEARN, _ELSEWHERE)
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
 _OTHER_CAUSES = {"hidden_state", "late_rows"}  # alike: what explains nearly all refutes the others
 _UNRELATED = 0.1  # of that: what inputs and functions may predict by chance
@@ -221,14 +228,24 @@ def _unexplained_text(test: StructureTest | None, left: float, fit: Any, result:
             f"{percent(best.share)} of the free run's error on held-out rows, beyond what its "
             "own past predicts"
         )
-    remedy = _SEARCH if fit.learns else _LEARN
     moved = (
         "The 95 % intervals count noise only; missing physics may have moved the parameters by "
         "more."
         if given
         else "Missing physics may have moved the parameters."
     )
-    return f"{what}. {moved} {remedy}"
+    return f"{what}. {moved} {_remedy(fit, result)}"
+
+
+def _remedy(fit: Any, result: Findings) -> str:
+    """Return what to do about missing terms: another thing where a learner did not find them."""
+    if fit.learns:
+        return _SEARCH
+    if not any(warning.code == "physics_alone" for warning in result.warnings):
+        return _LEARN
+    motion = None if fit.setup is None else getattr(fit.setup.problem, "motion", None)
+    outputs = () if motion is None else output_warnings(motion)
+    return " ".join([*(one.text for one in outputs), _ELSEWHERE])
 
 
 def _term_of(result: Findings, family: FamilyTest) -> str:
@@ -274,7 +291,7 @@ def _with_remedy(result: F, found: str, causes: Collection[str]) -> F:
     refuted = _OTHER_CAUSES - set(causes)
     others = [one for one in result.warnings if one.code not in refuted]
     warnings = [
-        Warning(one.code, one.text.replace(_SEARCH, done).replace(_LEARN, done))
+        Warning(one.code, reduce(lambda text, old: text.replace(old, done), _REMEDIES, one.text))
         if one.code == "unexplained"
         else one
         for one in others

@@ -4,6 +4,11 @@ Rows and columns are filtered by the autoregression of the errors beside the mod
 Orcutt 1949), so that what remains of noise is white. A family counts where its F-test rejects at
 the level divided by the number of families and it predicts blocks of rows that it was not fitted
 to.
+
+One filter is the same for all rows. Noise that enters equations with products, such as those of a
+switched converter, has a colour that changes with the signals, and left from row to row it looks
+like structure. Filtered by the model's own step it is the error one step ahead: where that is
+white, it has to show a family, too.
 """
 
 from __future__ import annotations
@@ -57,6 +62,11 @@ class FamilyTest:
     p: float
     term: MemoryTerm | None = None
     moves: tuple[float, ...] = ()
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What distinguishes its family from the others."""
+        return self.equation, self.on, self.kind, "" if self.term is None else self.term.on
 
     @property
     def name(self) -> str:
@@ -123,6 +133,8 @@ class Candidates:
         families: what may be added, with as many columns as terms.
         added: the families' columns of every run (T, ny, K).
         shift: by how much the parameters of `runs` differ from the model's (nt,).
+        one_step: filters what is added to the outputs of a run (T, ny, k) by the model's own step;
+            None where the model has no such filter.
     """
 
     runs: list[LinearRun]
@@ -130,6 +142,7 @@ class Candidates:
     families: list[Family]
     added: list[np.ndarray]
     shift: Vector
+    one_step: Callable[[LinearRun, np.ndarray], np.ndarray] | None = None
 
     def test(self, coloured_beside: FamilyTest | None = None) -> Tests | None:
         """Test all families in rows filtered by the colour of the errors.
@@ -144,7 +157,7 @@ class Candidates:
                 np.concatenate([columns, new[..., own]], axis=2)
                 for columns, new in zip(base, self.added, strict=True)
             ]
-        nt, known, colours = len(shift), self.base[0].shape[2], error_colours(runs, base)[1]
+        known, colours = self.base[0].shape[2], error_colours(runs, base)[1]
         both = [np.concatenate(each, axis=2) for each in zip(self.base, self.added, strict=True)]
         whole = np.concatenate(
             [filter_rows(piece, colours) for piece in stacked_rows(runs, both, error_scale(runs))]
@@ -153,22 +166,69 @@ class Candidates:
             return None
         if not np.isfinite(whole).all():
             return None
-        starts = slice(nt, nt + runs[0].states.shape[1] * len(runs))
-        q = span(whole[:, starts], RANK)
-        # They move a few rows of one run only: blocks would not show them
-        whole = whole - q @ (q.T @ whole)
-        whole[:, starts] = 0.0
-        size = np.linalg.norm(whole, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        whole = whole / size
+        whole, size = self._normalised(whole)
         static = np.concatenate(
             [np.full(len(family.terms), family.kind == STATIC) for family in families]
         )
         own, simple = list(range(known)), [known + int(j) for j in np.flatnonzero(static)]
         turn, reduced = np.linalg.qr(whole)  # few rows say of the columns what all rows say
         run = partial(_test_families, turn, reduced, known=known, families=families, size=size)
-        beside = run(own, shift=shift)
-        return Tests(whole, known, size, beside, partial(run, own + simple, shift=None))
+        beside = self._sure_one_step(run(own, shift=shift), own)
+
+        def find_hidden() -> list[FamilyTest]:
+            return self._sure_one_step(run(own + simple, shift=None), own + simple)
+
+        return Tests(whole, known, size, beside, find_hidden)
+
+    def _normalised(self, whole: Matrix) -> tuple[Matrix, Vector]:
+        """Return rows without what the starts explain, in units of their norms, and the norms."""
+        first = len(self.shift)
+        starts = slice(first, first + self.runs[0].states.shape[1] * len(self.runs))
+        q = span(whole[:, starts], RANK)
+        # They move a few rows of one run only: blocks would not show them
+        whole = whole - q @ (q.T @ whole)
+        whole[:, starts] = 0.0
+        size = np.linalg.norm(whole, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        return whole / size, size
+
+    @cached_property
+    def _one_step_rows(self) -> Matrix | None:
+        """Columns and errors filtered by the model's own step; None unless these are white."""
+        if self.one_step is None:
+            return None
+        runs, filters = self.runs, partial(map, self.one_step, self.runs)
+        errors = [one[..., 0] for one in filters([run.error[..., None] for run in runs])]
+        runs = [replace(run, error=error) for run, error in zip(runs, errors, strict=True)]
+        pieces, colours = error_colours(runs, list(filters(self.base)))
+        if any(len(colour) > 1 for colour in colours):
+            return None
+        scale = error_scale(runs)[:, None]
+        added = [one / scale for one in filters(self.added)]
+        known = self.base[0].shape[2]
+        whole = np.concatenate(
+            [
+                np.concatenate([own[..., :known], new, own[..., known:]], axis=2)
+                for own, new in zip(pieces, added, strict=True)
+            ]
+        )
+        whole = whole.reshape(-1, whole.shape[2])
+        return self._normalised(whole)[0] if np.isfinite(whole).all() else None
+
+    def _sure_one_step(self, tests: list[FamilyTest], base: list[int]) -> list[FamilyTest]:
+        """Return tests with the larger p of their own and of those one step ahead.
+
+        Only where the errors one step ahead are white.
+        """
+        if not any(one.sure for one in tests) or self._one_step_rows is None:
+            return tests
+        turn, reduced = np.linalg.qr(self._one_step_rows)
+        known = self.base[0].shape[2]
+        again = _test_families(
+            turn, reduced, base, known, self.families, np.ones(reduced.shape[1]), None
+        )
+        found = {one.key: one.p for one in again}
+        return [replace(one, p=max(one.p, found.get(one.key, 1.0))) for one in tests]
 
     def places_of(self, one: FamilyTest) -> list[int]:
         """Return the places of a tested family's columns among those of all families."""

@@ -176,7 +176,8 @@ def structure_test(
     recordings = record.recordings if by_experiment else ()
     added = _added_columns(model, runs, recordings)
     depending = partial(depending_columns, model, runs, *_common_signals(model, runs))
-    found = _structure_of(Candidates(runs, own, *added, moved), depending)
+    one_step = _equations(model).one_step
+    found = _structure_of(Candidates(runs, own, *added, moved, one_step), depending)
     if found is None:
         return None
     delayed = tuple(_equations(model).delayed(runs[0]))
@@ -311,12 +312,26 @@ class _OfOutputs:
             into_state[:, place] = columns
         return into_state, into_output
 
+    def one_step(self, run: LinearRun, moved: np.ndarray) -> np.ndarray:
+        """Return what was added to the equations so that the outputs moved by (T, ny, k).
+
+        The inverse of `enter` and `LinearRun.respond`; of a run's errors, those one step ahead.
+        """
+        found, outputs = np.array(moved, dtype=float), moved.shape[1]
+        state = np.zeros((run.states.shape[1], moved.shape[2]))
+        for step in range(len(found)) if len(state) else ():
+            found[step] -= run.to_output[step] @ state
+            state = run.to_state[step] @ state
+            state[:outputs] += found[step]
+        return found
+
 
 @dataclass(frozen=True)
 class _OfStates:
     """The equations of a motion: those of its states."""
 
     form: MotionDynamics
+    one_step: None = None  # the noise of outputs does not enter its equations
 
     def signals(self, run: LinearRun) -> dict[str, Vector]:
         """Return states and inputs, and what the learner sees beside them."""
