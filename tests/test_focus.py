@@ -112,6 +112,9 @@ def test_why_a_learner_is_left_out_agrees_with_the_errors(seed):
     )
     assert text.startswith("the gain of a learner" if least < own else "no learner is better")
     assert ("is not sure" in text) == (least < own)
+    one_step = next(c.error for c in found.focus.candidates if c.focus == "prediction")
+    preferred = found.focus.chosen == "simulation" and one_step < own
+    assert ("taken unless its error there is clearly larger" in found.focus.text) == preferred
 
 
 def test_a_learner_that_is_wanted_is_kept():

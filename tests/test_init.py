@@ -1102,6 +1102,17 @@ def test_a_time_that_begins_anew_separates_experiments(tmp_path):
     assert (data["sampling_time"], data["train"]["rows"]) == (0.5, [[0, 120], [120, 225]])
 
 
+def test_a_time_that_begins_anew_is_one_where_roles_are_asked_for(tmp_path):
+    u, y = np.random.default_rng(0).normal(size=(2, 300))
+    time = 0.5 * (np.arange(300) % 150)
+    frame = pd.DataFrame({"part": np.repeat([1, 2], 150), "time": time, "flow": u, "dose": y})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml")
+    assert done.code == 2
+    assert "time (the time, which begins anew with each experiment)" in done.err
+    assert "part (numbers the experiments)" in done.err
+
+
 @pytest.mark.parametrize("name", ["part", "id"])
 def test_a_column_that_numbers_the_experiments_is_no_input(tmp_path, name):
     """By its name, or since the time begins anew with it; it was taken for an input."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from test_cli import run
 
 import orthaug as oa
 
@@ -120,3 +123,16 @@ def test_a_stable_plant_and_one_that_is_given_its_segments_are_left(fit):
         ["u"],
     )
     assert oa.estimate(record, hanging, learner=None).criterion.segment in (0, 512)
+
+
+def test_check_fits_physics_to_runs_that_the_plant_can_follow(tmp_path):
+    np.savetxt(
+        tmp_path / "run.csv", np.column_stack(balanced()), delimiter=",", header="u,y", comments=""
+    )
+    (tmp_path / "spec.toml").write_text(SPEC)
+    done = run("check", tmp_path / "spec.toml", "--json")
+    found = json.loads(done.out)
+    said = {warning["code"]: warning["text"] for warning in found["warnings"]}
+    assert "twenty-fold" in said["unstable_plant"] and "other_start" not in said
+    errors = [trial["residual"] for trial in found["motion"]["holds"]]
+    assert 0 < min(errors) < 0.1

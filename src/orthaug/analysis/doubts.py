@@ -58,7 +58,7 @@ _LEARN = (
 )
 _ELSEWHERE = (
     "The learner that was tried does not explain it: let it see other signals, or add it to other "
-    "equations or outputs; or search for missing terms and states with `[[suspects]]`."
+    "equations or outputs; or search for missing terms with `[[suspects]]`."
 )
 _REMEDIES = (_SEARCH, _LEARN, _ELSEWHERE)
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory

@@ -149,6 +149,7 @@ def on_longest(
     longest = max(problem.record.experiments, key=len)
     first = longest.rows(0, rows_of_trials(problem))
     record = replace(problem.record, experiments=(first,))
+    criterion = criterion.on(record, most=problem.steps_to_leave())  # as training does
     task = MotionTask.of(problem.on(record), learner, criterion)
     return replace(task, known=known).prepare(solver, structure)
 

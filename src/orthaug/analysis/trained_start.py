@@ -67,7 +67,7 @@ def from_trained_start(
     if other is None:
         return None
     if other.segment:
-        return other, _unstable(other.segment, fit.problem.record.sampling_time)
+        return other, unstable_warning(other.segment, fit.problem.record.sampling_time)
     if any(run.diverged for run in free_run.trajectories):
         return None
     # Each output by itself: in a sum the noise of one hides what the start makes of another
@@ -152,7 +152,8 @@ def _in_pieces(record: Record) -> Record:
     return replace(record, experiments=tuple(pieces))
 
 
-def _unstable(segment: int, step: float) -> Warning:
+def unstable_warning(segment: int, step: float) -> Warning:
+    """Return the warning on a plant in whose free runs errors grow twenty-fold in a segment."""
     text = (
         f"the plant is unstable: errors of a free run grow twenty-fold in about {segment} samples "
         f"({segment * step:.3g} s), so none follows the record. Training and the tests of the "

@@ -288,6 +288,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.analysis.input_timing import find_late_inputs, try_holds
         from orthaug.analysis.motion_identifiability import identify_ranks, ill_conditioned_alone
         from orthaug.analysis.other_solutions import find_other_solution
+        from orthaug.analysis.trained_start import unstable_warning
         from orthaug.fitting.motion_task import restart_warnings
         from orthaug.fitting.segmented_motion import SegmentedMotion
         from orthaug.inference.nearly_shared import output_warnings, shared_warnings
@@ -329,6 +330,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         late = () if misread else find_late_inputs(trial.task, solver)
         warnings += [*misread, *(one.warning for one in late)]
         warnings += restart_warnings(trial.task.physics)
+        if segment := problem.steps_to_leave():
+            warnings.append(unstable_warning(segment, problem.record.sampling_time))
         if full_rank and trial.task.physics is not None:  # else there are others anyway
             q = trial.task.physics.end.point.theta
             other = find_other_solution(trial.task.plan, solver, q)

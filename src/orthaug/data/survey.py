@@ -57,7 +57,11 @@ class Survey:
 
     def why_not(self, column: Column) -> str:
         """Return the reason why a column is no channel."""
-        refused = self.looks_like_time(column)
+        if column is self.clock.faulty and self.clock.restarts:
+            return "the time, which begins anew with each experiment"
+        number, refused = self.experiment_column(()), self.looks_like_time(column)
+        if column is number and self._says_so(column):
+            return "numbers the experiments"
         return column.unusable or (
             "constant" if column.constant else refused.reason if refused else "not named"
         )

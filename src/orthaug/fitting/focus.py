@@ -327,6 +327,11 @@ def _best_estimate(choosing: _FocusChoice, reason: str) -> Estimate:
         "runs on held-out rows, in standard deviations of the output: "
         f"{'; '.join(one.described for one in compared)}. The result is {named[key]}."
     )
+    if key == (FREE_RUN, False) and errors[key] > errors.get((ONE_STEP, False), math.inf):
+        text += (
+            " Of physics alone, that trained on the free run is taken unless its error there is "
+            "clearly larger."
+        )
     if choosing.options["validation"] is None and choosing.folds.note:
         text += f" {choosing.folds.note}"
     warnings = list(best.warnings)
