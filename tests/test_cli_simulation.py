@@ -145,9 +145,14 @@ def test_ways_to_train_on_the_free_run(tmp_path, training):
 
 
 def test_physics_alone_on_the_free_run(tmp_path):
-    result = fit(project(tmp_path / "p", ALONE, FREE, **system(0, 600, sensor=0.3)))
+    """Noise on the sensor is what the free run is for: it biases no parameter there."""
+    spec = project(tmp_path / "p", ALONE, FREE, **system(0, 600, sensor=0.3))
+    printed, result = printed_fit(spec)
     assert result["validation"] is None and result["residuals"]["verdict"] == "sensor_noise"
     assert result["warnings"] == []
+    verdict = unfolded(printed).partition("Verdict:")[2]
+    assert "as physics." in verdict and "Do not read" not in verdict
+    assert "one-step estimates" not in verdict
     for parameter, truth in zip(result["parameters"], (1.5, -0.7, 1.0), strict=True):
         assert abs(parameter["value"] - truth) < 4 * parameter["std"]
 

@@ -27,6 +27,7 @@ _MOST_DOUBTS = 3  # in the first sentence
 _WORSE = 1.5  # times the error on training data: then 1/5 of a Gaussian error is outside the band
 _STOPPED = ("iteration_limit", "no_descent", "stopped")
 _UNSTABLE = "unstable_plant"
+_SENSOR = "sensor_noise"
 _RAN_AWAY = "free_run_diverged"
 _NO_FREEDOM = "no_degrees_of_freedom"  # any physics follows so few rows
 _COLOURED = "coloured_residual"  # of the free run of a fit that takes it for white
@@ -322,14 +323,14 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         size = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
         verb = "is" if len(biased) == 1 else "are"
         yield f"{join_words(biased)} {verb} {'probably ' * probably}biased{size}"
-    if result.residuals is not None and result.residuals.verdict in ("unmodelled", "sensor_noise"):
+    if result.residuals is not None and not _noise_alone(result):
         coarse = list(result.residuals.steps or {})
         yield {
             "unmodelled": f"its error is no larger than the steps in which {join_words(coarse)} "
             f"{'is' if len(coarse) == 1 else 'are'} recorded"
             if coarse
             else "its residual contains more than noise",
-            "sensor_noise": "noise on the measured output biases its one-step estimates",
+            _SENSOR: "noise on the measured output biases its one-step estimates",
         }[result.residuals.verdict]
     error, _ = _worst_score(result.scores)
     if error is not None and error > _GOOD:
@@ -503,12 +504,13 @@ def _may_lack_terms(result: FitResult | RowResult) -> bool:
     return (found.missing.p or 0.0) < _DOUBTFUL and (found.missing.share or 0.0) > _NAMED
 
 
-def _noise_alone(result: FitResult) -> bool:
-    """Return whether the residual shows nothing that would bias the parameters."""
-    return result.residuals is None or result.residuals.verdict not in (
-        "unmodelled",
-        "sensor_noise",
-    )
+def _noise_alone(result: FitResult | RowResult) -> bool:
+    """Return whether the residual shows nothing that would bias the parameters.
+
+    Noise on the sensor biases those of one step ahead, which a warning says.
+    """
+    verdict = None if result.residuals is None else result.residuals.verdict
+    return verdict != "unmodelled" and (verdict != _SENSOR or not _has_warning(result, _SENSOR))
 
 
 def _is_known(row: ParameterResult) -> bool:
