@@ -658,7 +658,7 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
         rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
     )
     assert rows["c"]["bias"]["cause"] == "friction"
-    assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-3)
+    assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-9)
     assert "no suspect explains" not in out
     assert "of what the learner found is friction" in out and "biased" in [
         w["code"] for w in told["warnings"]

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import first_words, percent
-from orthaug.inference.covariance import interval, reach
+from orthaug.inference.covariance import reach
 
 # Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
 _AS_CLOSE = 12.0
@@ -93,7 +93,7 @@ def most_mixed(best: float, noise: float) -> float:
 
 def hull(
     value: Vector,
-    std: Vector,
+    noise: Float[np.ndarray, "n 2"],
     freedom: float,
     candidates: Sequence[Candidate],
     extra: Vector | float = 0.0,
@@ -101,15 +101,16 @@ def hull(
     """Return 95 % intervals (n, 2) that hold the truth whichever of the candidates is the cause.
 
     Args:
+        noise: the intervals by noise alone; those of positive parameters reach farther upwards, and
+            do so beside a bias, too.
         extra: a standard deviation that every cause has beside its own.
     """
-    each = np.array(
-        [
-            interval(value - c.moved, np.sqrt(std**2 + c.unsure**2 + extra**2), freedom)
-            for c in candidates
-        ]
-    )
-    return np.stack([each[..., 0].min(axis=0), each[..., 1].max(axis=0)], axis=-1)
+    below, above = value - noise[:, 0], noise[:, 1] - value
+    unsure = [reach(freedom) * np.hypot(c.unsure, extra) for c in candidates]
+    pairs = list(zip(candidates, unsure, strict=True))
+    low = np.min([value - c.moved - np.hypot(below, more) for c, more in pairs], axis=0)
+    high = np.max([value - c.moved + np.hypot(above, more) for c, more in pairs], axis=0)
+    return np.stack([low, high], axis=-1)
 
 
 def is_determined(value: float, std: float, freedom: float, low: float, high: float) -> bool:

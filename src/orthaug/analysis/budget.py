@@ -338,7 +338,8 @@ def budget_by(
     other = np.linalg.norm(shifts, axis=0)
     candidates = _candidates(terms, found, shifts, declared)
     std = fit.known_std
-    ends = hull(value, std, fit.freedom, candidates, other)
+    noise = np.full((len(value), 2), np.nan) if fit.interval is None else fit.interval
+    ends = hull(value, noise, fit.freedom, candidates, other)
     ends = np.clip(ends, *terms.bounds.T[:, :, None])
     owners = _owners(found, np.array([causes.moved for causes in found]))
     parameters = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
