@@ -39,7 +39,9 @@ def add_retries(
 ) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return the planned runs with their ends, and runs that were added.
 
-    The latter have weaker regularizations, where evidence silenced all others.
+    The latter have weaker regularizations, where evidence silenced all others. Of the runs without
+    regularization the lowest stays: held-out rows then choose between regularizations, where a
+    run from every seed on every block would take most of the time.
 
     Args:
         starts, runs: planned runs and how they ended.
@@ -51,12 +53,29 @@ def add_retries(
     if not (by_evidence and ended and all(is_silenced(run.effective, outputs) for run in runs)):
         return starts, runs
     free, ends = make([start._replace(regularization="none") for start in starts])
-    usable = [end for end in ends if end.ending.usable]
+    usable = [i for i, end in enumerate(ends) if end.ending.usable]
     if not usable:
         return starts, runs
-    lowest = min(usable, key=lambda end: end.end.point.loss)
-    more, others = make([start._replace(regularization=found_ridge(lowest)) for start in starts])
-    return starts + free + more, runs + ends + others
+    lowest = min(usable, key=lambda i: ends[i].end.point.loss)
+    start, end = free[lowest], ends[lowest]
+    more, others = make([start._replace(regularization=found_ridge(end))])
+    return [*starts, start, *more], [*runs, end, *others]
+
+
+def first_alike(starts: Sequence[PlannedRun], runs: Sequence[Any], outputs: int) -> list[int]:
+    """Return for each run the first that left the same: evidence that silenced the learner.
+
+    Args:
+        starts, runs: planned runs and how they ended.
+        outputs: of the learner.
+    """
+    silenced = [
+        start.regularization == "evidence"
+        and run.ending.usable
+        and is_silenced(run.effective, outputs)
+        for start, run in zip(starts, runs, strict=True)
+    ]
+    return [silenced.index(True) if silent else i for i, silent in enumerate(silenced)]
 
 
 def found_ridge(run: Any) -> float:

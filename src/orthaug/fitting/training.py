@@ -29,7 +29,13 @@ from orthaug.fitting.kinds import Solver
 from orthaug.fitting.learned import FinishedRun, PlannedRun, Task, TrainedLearner
 from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.setup import FOLD_ITERATIONS
-from orthaug.fitting.silence import add_retries, fold_ridges, is_silenced, retry_warnings
+from orthaug.fitting.silence import (
+    add_retries,
+    first_alike,
+    fold_ridges,
+    is_silenced,
+    retry_warnings,
+)
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.models.learners import Bound
@@ -388,12 +394,17 @@ def _held_out(
             "too few rows for %d blocks of cross-validation; the lowest loss chooses", choice.blocks
         )
         return None
-    LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(starts))
     ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
+    like = first_alike(starts, runs, task.bound.ny)
+    made = list(dict.fromkeys(like))
+    LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(made))
     taken, task = max(run.iterations for run in runs), task.after(runs)
-    given = (task, list(zip(starts, ridges, strict=True)), structure, solver, taken)
+    given = (task, [(starts[i], ridges[i]) for i in made], structure, solver, taken)
     found = runner.map(_on_fold, given, folds.pairs)
-    pieces = [[p for block in column for p in block] for column in zip(*found, strict=True)]
+    alone, *of_made = (
+        [p for block in column for p in block] for column in zip(*found, strict=True)
+    )
+    pieces = [alone, *(of_made[made.index(i)] for i in like)]
     labels = tuple(
         f"block {i + 1} of {choice.blocks}"
         for i, (_, held) in enumerate(folds.pairs)
