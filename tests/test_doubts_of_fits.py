@@ -537,6 +537,13 @@ def test_a_loss_to_surroundings_counts_from_their_temperature():
     assert best.term == f"({best.variable} - {best.reference:.4g})" and best.term in str(best)
 
 
+def test_no_other_solution_is_looked_for_where_every_run_takes_very_many_substeps():
+    """A search of minutes, for a hint, would take longer than all the rest of the fit."""
+    record, motion = two_lags(1)
+    fit = oa.estimate(record, replace(motion, substeps=48), learner=None)
+    assert "several_solutions" not in {w.code for w in fit.diagnose().warnings}
+
+
 def test_a_mode_that_the_integrator_distorts_is_no_other_solution():
     """A fast mode far below a step is right under long steps alone: no warning names it."""
     u, x, wall, y = stepped(1200, 9, held=6), 0.0, 0.0, []

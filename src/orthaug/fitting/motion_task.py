@@ -151,7 +151,8 @@ def is_cheap(segmented: SegmentedMotion) -> bool:
     motion = segmented.problem.motion
     if motion.source is not None:  # each evaluation takes as long as those of many expressions
         return False
-    return len(segmented.record) * max(motion.size, _FEWEST) <= _CHEAP
+    evaluations = len(segmented.record) * segmented.dynamics.substeps
+    return evaluations * max(motion.size, _FEWEST) <= _CHEAP
 
 
 def draw_starts(coordinates: Coordinates, middles: Sequence[Vector]) -> Iterator[Vector]:
