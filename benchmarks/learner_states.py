@@ -1,8 +1,11 @@
 """A static learner and one with states of its own, on the same physics and rows, in free run.
 
 Measured sets in their official protocols: Bouc-Wen (Noël and Schoukens 2016, simulated, trained on
-its multisine, tested on multisine and sine sweep without noise) and a magneto-rheological damper.
-Prints RMSE on the tests and the time; `python benchmarks/learner_states.py [bouc_wen] [mr_damper]`.
+its multisine, tested on multisine and sine sweep without noise), a magneto-rheological damper, as a
+lag with the learner in its equation and as linear damping and inertia with the learner beside the
+force (`mr_damper_output`), and a simulated model car (every other run of its folder trains).
+Prints RMSE and its share of the output's deviation on the tests, θ with intervals and processor
+time; `python benchmarks/learner_states.py NAME [STATES ...]`, such as `f1tenth none 0 1`.
 
 `maxwell` draws 40 records of a mass on a spring beside a Maxwell element that the physics lacks,
 and counts how often the intervals of m and k contain the truth.
@@ -12,19 +15,38 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import h5py
 import numpy as np
+from machine import data_folder
 from scipy.io import loadmat
 
 import orthaug as oa
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = data_folder()
 ROWS = 8192  # of the multisine: one period
 
 
-def bouc_wen() -> tuple[oa.Record, dict[str, oa.Record], oa.Motion, tuple[str, ...]]:
+@dataclass(frozen=True)
+class Case:
+    """Records, physics and what its learner sees; `options` go to `oa.estimate`.
+
+    `limits` are iterations by the learner's states, where the usual ones take many minutes.
+    """
+
+    train: oa.Record
+    tests: dict[str, oa.Record]
+    motion: oa.Motion
+    inputs: tuple[str, ...]
+    hidden: int = 12
+    skip: int = 50
+    options: dict[str, Any] = field(default_factory=dict)
+    limits: dict[int, int] = field(default_factory=dict)
+
+
+def bouc_wen() -> Case:
     """Return records and the linear oscillator of m = 2 kg, with c and k to estimate."""
 
     def read(part: str, name: str, rows: slice = slice(None)) -> oa.Record:
@@ -51,18 +73,19 @@ def bouc_wen() -> tuple[oa.Record, dict[str, oa.Record], oa.Motion, tuple[str, .
         constants={"m": 2.0},
         hold="first-order",
     )
-    return train, tests, motion, ("v",)
+    return Case(train, tests, motion, ("v",))
 
 
-def mr_damper() -> tuple[oa.Record, dict[str, oa.Record], oa.Motion, tuple[str, ...]]:
-    """Return records and a damper that is linear, with the inertia of its oil."""
+def damper_rows(rows: slice) -> oa.Record:
+    """Return rows of the damper's record."""
     table = loadmat(DATA / "mr_damper" / "damper.mat")
-    u, y = (table[name].ravel() for name in ("X", "y"))
+    u, y = (table[name].ravel()[rows] for name in ("X", "y"))
+    channels = {"inputs": ["velocity"], "outputs": ["force"]}
+    return oa.Record.from_arrays(u, y, sampling_time=0.005, **channels)
 
-    def part(rows: slice) -> oa.Record:
-        channels = {"inputs": ["velocity"], "outputs": ["force"]}
-        return oa.Record.from_arrays(u[rows], y[rows], sampling_time=0.005, **channels)
 
+def mr_damper() -> Case:
+    """Return records and a damper that is linear, with the inertia of its oil."""
     motion = oa.Motion.from_equations(
         [oa.State("f", "(viscous*velocity + offset - f)/lag", "force", learned=True)],
         [oa.Output("force", "f")],
@@ -74,7 +97,64 @@ def mr_damper() -> tuple[oa.Record, dict[str, oa.Record], oa.Motion, tuple[str, 
         ["velocity"],
         hold="first-order",
     )
-    return part(slice(0, 2000)), {"rest": part(slice(2000, 3499))}, motion, ("f", "velocity")
+    train, tests = damper_rows(slice(0, 2000)), {"rest": damper_rows(slice(2000, 3499))}
+    return Case(train, tests, motion, ("f", "velocity"))
+
+
+def mr_damper_output() -> Case:
+    """Return records and a linear damper with inertia, whose force the learner is added to.
+
+    The acceleration is that of a velocity behind a lag of 20 ms.
+    """
+    motion = oa.Motion.from_equations(
+        [oa.State("s", "(velocity - s)/0.02", 0.0)],
+        [oa.Output("force", "viscous*velocity + inertia*(velocity - s) + offset", learned=True)],
+        [
+            oa.PhysicalParameter("viscous", -3.0, "N s/cm"),
+            oa.PhysicalParameter("inertia", 0.0, "N s/cm"),
+            oa.PhysicalParameter("offset", 0.0, "N"),
+        ],
+        ["velocity"],
+        hold="first-order",
+    )
+    return replace(mr_damper(), motion=motion, inputs=("velocity",), hidden=8, skip=0)
+
+
+def f1tenth() -> Case:
+    """Return records and a single-track car of linear tyres and a linear drive train."""
+
+    def read(part: str, every: int = 1) -> oa.Record:
+        runs = []
+        for path in sorted((DATA / "f1tenth" / part).glob("*.csv"))[::every]:
+            table = np.genfromtxt(path, delimiter=",", names=True)
+            u, y = (np.stack([table[name] for name in names], 1) for names in (inputs, outputs))
+            channels = {"inputs": inputs, "outputs": outputs}
+            runs.append(oa.Record.from_arrays(u, y, sampling_time=0.025, **channels))
+        return replace(runs[0], experiments=tuple(run.experiments[0] for run in runs))
+
+    inputs, outputs = ["delta", "d"], ["v_long", "v_lat", "yaw_rate"]
+    initial = {"pull": 15.0, "drag": 2.0, "cf": 20.0, "cr": 20.0, "turn": 30.0}
+    drive = "pull*d - drag*vx + w*vy - front*sin(delta)"
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("vx", drive, "v_long", learned=True),
+            oa.State("vy", "front*cos(delta) + rear - w*vx", "v_lat", learned=True),
+            oa.State("w", "turn*(lf*front*cos(delta) - lr*rear)", "yaw_rate", learned=True),
+        ],
+        [oa.Output("v_long", "vx"), oa.Output("v_lat", "vy"), oa.Output("yaw_rate", "w")],
+        [oa.PhysicalParameter(name, at, min=0) for name, at in initial.items()],
+        inputs,
+        constants={"lf": 0.163, "lr": 0.168},
+        define={
+            "speed": "max(vx, 0.3)",
+            "front": "cf*(delta - (vy + lf*w)/speed)",
+            "rear": "cr*(lr*w - vy)/speed",
+        },
+        substeps=2,
+    )
+    seen, tests = ("vx", "vy", "w", *inputs), {"official": read("test")}
+    options, limits = {"criterion": oa.Simulation(segment=100)}, {0: 60, 1: 40, 2: 40}
+    return Case(read("train", 2), tests, motion, seen, skip=0, options=options, limits=limits)
 
 
 def maxwell(seed: int) -> tuple[oa.Record, oa.Record, oa.Motion]:
@@ -136,28 +216,51 @@ def cover(draws: int = 40) -> None:
     print(f"free run {100 * np.median(errors):.2f} % of the output's deviation (median)")
 
 
-SETS = {"bouc_wen": bouc_wen, "mr_damper": mr_damper}
+SETS = {
+    "bouc_wen": bouc_wen,
+    "mr_damper": mr_damper,
+    "mr_damper_output": mr_damper_output,
+    "f1tenth": f1tenth,
+}
 
 
-def main(names: list[str]) -> None:
-    """Print a line for physics alone, the static learner, and learners with states."""
-    if not names or "maxwell" in names:
+def score(fit: Any, record: oa.Record, skip: int) -> str:
+    """Return the RMSE of the free run on all experiments, and its share of the deviation."""
+    errors = np.concatenate([run.errors[skip:] for run in fit.model.simulate(record).trajectories])
+    size = np.concatenate([one.outputs[skip:] for one in record.experiments]).std(axis=0)
+    rmse = np.sqrt(np.nanmean(errors**2, axis=0))
+    return ", ".join(f"{e:.4g} ({100 * e / s:.1f} %)" for e, s in zip(rmse, size, strict=True))
+
+
+def compare(name: str, learners: list[int | None]) -> None:
+    """Print what each learner of a set reaches; None is physics alone."""
+    case = SETS[name]()
+    for states in learners:
+        learner = None
+        if states is not None:
+            learner = oa.MLP((case.hidden,), inputs=case.inputs, states=states)
+        fixed = {"learner": learner, "blocks": 0, "fallback": False}
+        if states in case.limits:
+            fixed["solver"] = oa.LevenbergMarquardt(iterations=case.limits[states])
+        began = time.process_time()
+        fit = oa.estimate(case.train, case.motion, **fixed, **case.options)
+        spent = time.process_time() - began
+        kind = "physics alone" if states is None else f"learner of {states} states"
+        print(f"{name} {kind}: {fit.status.code}, {spent:.0f} s")
+        for test, record in case.tests.items():
+            print(f"    {test}: {score(fit, record, case.skip)}")
+        print(fit.parameters[["value", "ci95_low", "ci95_high"]].to_string(), flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Print a block for physics alone, the static learner, and learners with states."""
+    names = [one for one in arguments if one in SETS]
+    chosen = [one for one in arguments if one == "none" or one.isdigit()]
+    if not arguments or "maxwell" in arguments:
         cover()
-    for name in [one for one in names or SETS if one in SETS]:
-        train, tests, motion, inputs = SETS[name]()
-        for states in (None, 0, 1, 2):
-            learner = None if states is None else oa.MLP((12,), inputs=inputs, states=states)
-            began = time.perf_counter()
-            fit = oa.estimate(train, motion, learner=learner, blocks=0, fallback=False)
-            spent = time.perf_counter() - began
-            found = []
-            for test, record in tests.items():
-                (run,) = fit.model.simulate(record).trajectories
-                rmse = float(np.sqrt(np.nanmean(run.errors[50:] ** 2)))
-                percent = 100 * (1 - rmse / float(np.std(record.experiments[0].outputs[50:])))
-                found.append(f"{test} {rmse:.4g} ({percent:.1f} %)")
-            kind = "physics alone" if states is None else f"learner of {states} states"
-            print(f"{name:10} {kind:20} {'  '.join(found):50} {fit.status.code} {spent:.0f} s")
+    learners = [None if one == "none" else int(one) for one in chosen] or [None, 0, 1, 2]
+    for name in names if arguments else SETS:
+        compare(name, learners)
 
 
 if __name__ == "__main__":
