@@ -107,6 +107,7 @@ def test_a_fall_back_says_that_a_state_is_missing(tmp_path):
     )
     assert not said or ("95 %, noise only" in page and "count noise only" in page)
     assert "write the state out as a state of the motion" in " ".join(text.split())
+    assert "states of its own (learner.states). Or let the learner see" in " ".join(text.split())
     assert result["shared"] is None or result["shared"]["withdrawn"] == [
         "m",
         "k",

@@ -343,7 +343,7 @@ def _hidden_state(fit: Any, test: StructureTest) -> str:
     ]
     beside = f" ({', '.join(others[: _LISTED - 1])} nearly as much)" if others else ""
     remedy = (
-        f"{fit.problem.new_state}; or let the learner see lags or a filtered copy of that signal"
+        f"{fit.problem.new_state}. Or let the learner see lags or a filtered copy of that signal"
     )
     driven = best.on in {channel.name for channel in fit.problem.record.inputs}
     noisy = (

@@ -178,8 +178,8 @@ class Problem(PosedProblem):
     """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY."""
 
     new_state: ClassVar[str] = (
-        "add lags of outputs and inputs to the physics, or write the system as a motion with that "
-        "state"
+        "add lags of outputs and inputs to the physics, or write the system as a motion, with that "
+        "state or with a learner that has states of its own (learner.states)"
     )
 
     def __repr__(self) -> str:
@@ -506,7 +506,10 @@ class MotionProblem(GuessedMotion, PosedProblem):
         seen = {name for feature in self.features for name in feature.names}
         return tuple(name for name in self.motion.unread if name not in seen)
 
-    new_state: ClassVar[str] = "write the state out as a state of the motion with its own equation"
+    new_state: ClassVar[str] = (
+        "write the state out as a state of the motion with its own equation, or give the learner "
+        "states of its own (learner.states)"
+    )
 
     def __repr__(self) -> str:
         motion = self.motion
