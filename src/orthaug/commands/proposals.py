@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from orthaug._base.lines import join_words, plural
-from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
 from orthaug.analysis.findings import LateInputResult
@@ -31,6 +30,7 @@ _OTHER_NOISE = (
 _OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 _OTHER_UNIT = "It was not tried, because errors in another unit cannot be compared."
 _TERMS = 3  # suspected terms that are proposed
+_MOST = 0.5  # of the learner: what explains more may take its place, as a trial shows
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
 _WIDER = 2  # times the neurons
 _ZONE = "dead_zone"
@@ -289,12 +289,14 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
 
 
 def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator[Proposal]:
-    """Yield the term that explains nearly all of the learner, with no learner beside it."""
+    """Yield the term that explains most of the learner, with no learner beside it."""
     causes = {row.bias.cause for row in result.parameters if row.bias is not None}
-    for entry in result.bias or () if fit.learns else ():
-        sure = (entry.explained or 0.0) >= SURE_SHARE and entry.memory is None
-        if not sure or entry.name not in causes:
-            continue
+    most = [
+        entry
+        for entry in (result.bias or () if fit.learns else ())
+        if (entry.explained or 0.0) > _MOST and entry.memory is None and entry.name in causes
+    ]
+    for entry in sorted(most, key=lambda entry: -(entry.explained or 0.0))[:1]:
         place, size = entry.equation or entry.output, entry.coefficient_found
         for term in _term(job, entry.expression, place, size, ""):
             change = term.change | {"learner.kind": "none"}
