@@ -34,7 +34,7 @@ check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of th
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
-	@$(BIN)/python -m pytest -q tests/test_architecture.py
+	@$(BIN)/python -m pytest -q -m "" tests/test_architecture.py
 
 docs: $(STAMP)  ## build the documents as a site in build/site, to open from disk
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict

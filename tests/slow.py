@@ -5,6 +5,8 @@ anew, here on a machine that takes 1.5 times as long as that of `LONG` and `LONG
 
     python -m pytest -q -m "" -n auto --dist loadfile --no-loadscope-reorder --durations=0 > log
     python tests/slow.py log 1.5
+
+Tests that the log does not have stay on their list, so the log may be that of the suite alone.
 """
 
 from __future__ import annotations
@@ -17,8 +19,17 @@ LISTS = {name: Path(__file__).with_name(f"{name}.txt") for name in ("slow", "lon
 LONG, LONGEST = 0.8, 16.0  # s of its own, with one worker more than cores
 # Fixtures of a module that take longer than a quarter of a minute: each test that uses one is slow, or long
 FIXTURES = {
+    ("test_advice", "moved"),
+    ("test_controller", "beside_a_learner"),
+    ("test_innovations", "learned"),
+    ("test_motion_cli", "printed"),
+    ("test_motion_fit", "fitted"),
     ("test_motion_without_inputs", "fitted"),
+    ("test_paper", "additive"),
+    ("test_report_browser", "folder"),
     ("test_reproduction", "found"),
+    ("test_saved_results", "fits"),
+    ("test_selection", "selected"),
 }
 LONG_FIXTURES = {("test_learner_states", "fit")}
 # The main paths, and one test of each concept whose tests all take long: CI shows them however long they take
@@ -61,8 +72,10 @@ def write(log: Path, factor: float = 1.0) -> None:
     """Write the lists from the durations that pytest has printed on a machine slower by a factor."""
     found = filter(None, map(_LINE.match, log.read_text(encoding="utf-8").splitlines()))
     took = {line[2]: float(line[1]) / factor for line in found}
+    kept = {name: {test for test in listed(name) if test not in took} for name in LISTS}
     longest = {name for name, seconds in took.items() if seconds >= LONGEST} - KEPT
     slow = {name for name, seconds in took.items() if seconds >= LONG} - longest
+    longest, slow = longest | kept["long"], slow | kept["slow"]
     for name, tests in (("slow", slow), ("long", longest)):
         LISTS[name].write_text("\n".join(sorted(tests)) + "\n", encoding="utf-8")
         print(f"{name}: {len(tests)} tests")
