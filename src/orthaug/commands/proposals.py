@@ -322,7 +322,7 @@ def _term(
     made = job.physics.with_term(job, name, expression, place, float(size or 0.0))
     if made is not None:
         change, where = made
-        what = words or f"the term {expression}"
+        what = words or ("a constant" if expression == "1" else f"the term {expression}")
         yield Proposal(f"{what} {where}{note}", change, positive=name if positive else None)
 
 
