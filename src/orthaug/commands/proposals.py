@@ -259,12 +259,11 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
     if test is None or result.residuals is None or result.residuals.verdict != "unmodelled":
         return
     for term in test.terms[:_TERMS]:
-        words = "a constant" if term.variable is None else ""
         place = term.equation or term.output or term.beside
         note = ""
         if term.saturates is not None:
             note = f" (the input {term.variable} saturates at a size of {term.saturates:.3g})"
-        yield from _term(job, term.term, place, term.coefficient, words, note=note)
+        yield from _term(job, term.term, place, term.coefficient, "", note=note)
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
