@@ -174,12 +174,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.states.{other}.{key}": word.sub(state, str(entry[key]))
             for other, entry in states.items()
         }
-        first, moving = (
-            _first_of(job, late.input),
-            self._moving("lag", late.input, None, state, name),
-        )
+        moving = self._moving("lag", late.input, None, state, name)
         change |= {
-            f"motion.states.{state}": {key: moving, "start": first},
+            f"motion.states.{state}": {key: moving, "start": _first_of(job, late.input)},
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
         return change, f"a lag of {late.input} (the state {state}, time constant {name})"

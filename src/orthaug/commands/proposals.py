@@ -162,7 +162,7 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
     if any(proposal.ahead for proposal in late):  # beside it other causes are mistaken
         return _unique_proposals([proposal for proposal in late if proposal.ahead])
     states = list(_missing_states(job, result))
-    first, then = (states, late) if _state_explains_more(result) else (late, states)
+    first, then = (states, late) if states and _state_explains_more(result) else (late, states)
     found = [
         *first,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
@@ -263,7 +263,7 @@ def _missing_terms(job: Job, result: FitResult) -> Iterator[Proposal]:
         note = ""
         if term.saturates is not None:
             note = f" (the input {term.variable} saturates at a size of {term.saturates:.3g})"
-        yield from _term(job, term.term, place, term.coefficient, "", note=note)
+        yield from _term(job, term.term, place, term.coefficient, note=note)
 
 
 def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
@@ -284,7 +284,7 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
             found.append((share or 0.0, entry, size, positive))
     for _, entry, size, positive in sorted(found, key=lambda one: -one[0])[:_TERMS]:
         place, size = entry.equation or entry.output, size or entry.coefficient
-        yield from _term(job, entry.expression, place, size, "", positive=positive)
+        yield from _term(job, entry.expression, place, size, positive=positive)
 
 
 def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator[Proposal]:
@@ -297,7 +297,7 @@ def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator
     ]
     for entry in sorted(most, key=lambda entry: -(entry.explained or 0.0))[:1]:
         place, size = entry.equation or entry.output, entry.coefficient_found
-        for term in _term(job, entry.expression, place, size, ""):
+        for term in _term(job, entry.expression, place, size):
             change = term.change | {"learner.kind": "none"}
             words = f"{term.words} in place of the learner"
             yield replace(term, words=words, change=change, replaces=True)
@@ -308,7 +308,7 @@ def _term(
     expression: str,
     place: str | None,
     size: float | None,
-    words: str,
+    words: str = "",
     *,
     positive: bool = False,
     note: str = "",

@@ -470,7 +470,7 @@ def _motion_model(
         model = replace(model, seen=_feature_range(model, plan.record))
         model = _with_limits(model, plan.record)
     if plan.predictor is None and not briefly:  # a predictor forgets where it began
-        model = _with_window(model, _best_window(model, plan.record))
+        model = replace(model, starts=_best_starts(model, plan.record))
     return model
 
 
@@ -503,30 +503,24 @@ def _feature_range(model: Model[MotionDynamics], record: Record) -> Matrix | Non
     return np.stack([finite.min(axis=0), finite.max(axis=0)]) if finite.size else None
 
 
-def _with_window(model: Model[MotionDynamics], window: int) -> Model[MotionDynamics]:
-    """Return the model with another number of rows that give a state to predict from."""
-    assert isinstance(model.starts, EstimatedStates)
-    return replace(model, starts=replace(model.starts, window=window))
-
-
-def _best_window(model: Model[MotionDynamics], record: Record) -> int:
-    """Return the window of rows that predicts one step ahead best, at some rows of the data."""
+def _best_starts(model: Model[MotionDynamics], record: Record) -> EstimatedStates:
+    """Return the starts whose window predicts one step ahead best, at some rows of the data."""
     assert isinstance(model.starts, EstimatedStates)
     longest = max(record.experiments, key=len)
     tried = [n * (model.form.states + 1) for n in _WINDOWS]
     tried = [window for window in tried if window == tried[0] or 4 * window <= len(longest)]
+    best, least = replace(model.starts, window=tried[0]), np.inf
     if len(longest) <= tried[-1]:
-        return tried[0]
+        return best
     count = min(_TRIED_ROWS, len(longest) - tried[-1])
     rows = np.linspace(tried[-1], len(longest) - 1, count).astype(int)
-    best, least = tried[0], np.inf
     for window in tried:
-        starts = replace(model.starts, window=window)
+        starts = replace(best, window=window)
         with np.errstate(all="ignore"):
             errors = starts.errors(model, longest, record, rows) @ model.weight.T
             squares = np.sum(errors[~np.isnan(errors).any(axis=1)] ** 2, axis=1)
         if len(squares) and squares.mean() < 0.98 * least:  # longer only where clearly better
-            best, least = window, squares.mean()
+            best, least = starts, squares.mean()
     return best
 
 

@@ -404,13 +404,13 @@ def _held_out(
     alone, *of_made = (
         [p for block in column for p in block] for column in zip(*found, strict=True)
     )
-    pieces = [alone, *(of_made[made.index(i)] for i in like)]
+    pieces = tuple(of_made[made.index(i)] for i in like)
     labels = tuple(
         f"block {i + 1} of {choice.blocks}"
         for i, (_, held) in enumerate(folds.pairs)
         for _ in held.experiments
     )
-    return HeldOutErrors(folds.where, labels, pieces[0], tuple(pieces[1:]), note=folds.note)
+    return HeldOutErrors(folds.where, labels, alone, pieces, note=folds.note)
 
 
 def _lowest(task: Task, runs: Sequence[FinishedRun], structure: Structure) -> Model[Any] | None:

@@ -24,7 +24,7 @@ _SHORTEST, _LANES = 128, 16  # steps, and windows side by side
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
 _FEWEST = 8  # steps where each padded row is a call of the host
-SETTLED = 1e-10  # relative decrease that is not worth a step
+_SETTLED = 1e-10  # relative decrease that is not worth a step
 
 
 class Windows(NamedTuple):
@@ -77,7 +77,7 @@ def settle(
     weight: Matrix,
     loose: Vector,
     iterations: int = 12,
-    enough: float = SETTLED,
+    enough: float = _SETTLED,
 ) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
     """Return the states at the windows' first rows that minimise `‖weight e‖²`, and its value (m,).
 
@@ -87,6 +87,7 @@ def settle(
     Args:
         states: where to begin.
         loose: (n0,) how far a state may be from there before that counts as much as one error.
+        enough: the relative decrease that is not worth a step.
     """
     count = np.shape(states)[1]
     lanes = _padded_lanes(count, form.calls_host)
