@@ -17,12 +17,13 @@ import numpy as np
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import Warning
 from orthaug.fitting.held_out import HeldOutErrors, mean_square
-from orthaug.fitting.learned import FinishedRun, PlannedRun, TrainedLearner
+from orthaug.fitting.learned import FinishedRun, PlannedRun, Task, TrainedLearner
 from orthaug.fitting.solvers.minimize import evidence_ridge
 from orthaug.fitting.status import Ending
 
 _SILENT = 0.5  # effective weights: fewer do nothing
 _CONSTANT = 1.5  # effective weights for each output of the learner: one is a constant
+_LOOK = 100  # iterations that show whether a learner without regularization explains more
 _FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a constant
 
 
@@ -34,32 +35,56 @@ def is_silenced(effective: float, outputs: int) -> bool:
 def add_retries(
     starts: list[PlannedRun],
     runs: list[FinishedRun],
-    outputs: int,
-    make: Callable[[list[PlannedRun]], tuple[list[PlannedRun], list[Any]]],
+    task: Task,
+    make: Callable[[list[PlannedRun], int | None], tuple[list[PlannedRun], list[Any]]],
 ) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return the planned runs with their ends, and runs that were added.
 
-    The latter have weaker regularizations, where evidence silenced all others. Of the runs without
-    regularization the lowest stays: held-out rows then choose between regularizations, where a
-    run from every seed on every block would take most of the time.
+    The latter have weaker regularizations, where evidence silenced all others. A short run without
+    regularization from every seed comes first. Where none lowers the loss by more than so many
+    weights take from noise, evidence was right, and nothing is added. Otherwise the lowest goes on
+    to its end, with the ridge that evidence finds there: held-out rows then choose between
+    regularizations, where a run from every seed on every block would take most of the time.
 
     Args:
         starts, runs: planned runs and how they ended.
-        outputs: of the learner.
-        make: makes planned runs; one that fails is planned anew.
+        task: which they trained.
+        make: makes planned runs of at most so many iterations, or of as many as the solver allows;
+            one that fails is planned anew.
     """
+    outputs = task.bound.ny
     by_evidence = all(start.regularization == "evidence" for start in starts)
     ended = all(run.ending.usable and run.ending is not Ending.STOPPED for run in runs)
     if not (by_evidence and ended and all(is_silenced(run.effective, outputs) for run in runs)):
         return starts, runs
-    free, ends = make([start._replace(regularization="none") for start in starts])
-    usable = [i for i, end in enumerate(ends) if end.ending.usable]
+    free, looks = make([start._replace(regularization="none") for start in starts], _LOOK)
+    usable = [i for i, look in enumerate(looks) if look.ending.usable]
     if not usable:
         return starts, runs
-    lowest = min(usable, key=lambda i: ends[i].end.point.loss)
-    start, end = free[lowest], ends[lowest]
-    more, others = make([start._replace(regularization=found_ridge(end))])
+    lowest = min(usable, key=lambda i: _loss(looks[i]))
+    start, end = free[lowest], looks[lowest]
+    if _is_chance(end, min(map(_loss, runs))):
+        return starts, runs
+    if end.ending is Ending.RUNNING:
+        (start, *_), (end, *_) = make([start], None)
+    more, others = make([start._replace(regularization=found_ridge(end))], None)
     return [*starts, start, *more], [*runs, end, *others]
+
+
+def _is_chance(run: Any, silent: float) -> bool:
+    """Return whether a run lowers the loss of a silent learner by no more than noise explains.
+
+    γ free parameters lower a sum of N squares of noise by χ²(γ)/N of it; coloured residuals count
+    as fewer.
+    """
+    count, share = run.objective.samples(run.end.point)
+    explained = run.effective + 2 * np.sqrt(2 * run.effective)
+    return bool(silent - _loss(run) <= explained / (count * share) * silent)
+
+
+def _loss(run: Any) -> float:
+    """Return the loss where a run ended, without its regularization."""
+    return run.end.point.loss
 
 
 def first_alike(starts: Sequence[PlannedRun], runs: Sequence[Any], outputs: int) -> list[int]:

@@ -280,12 +280,15 @@ def _run_all(
     if not choice.retry or (choice.validation is None and not choice.blocks):
         return begun, runs
 
-    def run_again(planned: list[PlannedRun]) -> tuple[list[PlannedRun], list[FinishedRun]]:
+    def run_again(
+        planned: list[PlannedRun], most: int | None
+    ) -> tuple[list[PlannedRun], list[FinishedRun]]:
+        allowed = solver if most is None else solver.at_most(most)
         return _run(
-            task, planned, structure, solver, lambda i, *at: progress(len(begun) + i, *at), runner
+            task, planned, structure, allowed, lambda i, *at: progress(len(begun) + i, *at), runner
         )
 
-    return add_retries(begun, runs, task.bound.ny, run_again)
+    return add_retries(begun, runs, task, run_again)
 
 
 def _run(
