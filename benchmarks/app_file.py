@@ -86,14 +86,14 @@ def main() -> None:
                 time.sleep(1)
                 before, began = watched.most[server.pid], time.perf_counter()
                 tab.set_input_files("#dropped", file)
-                told = {}
+                found = {}
                 for what, seen in (
                     ("taken in", "text=run.csv is here"),
                     ("looked at", ".account"),
                     ("checked", ".parts table"),
                 ):
                     tab.wait_for_selector(seen)
-                    told[what] = time.perf_counter() - began
+                    found[what] = time.perf_counter() - began
                 for part, press, what, seen in (
                     ("Training", "Train", "trained", "text=Training is done"),
                     ("Report", None, "its report open", "iframe"),
@@ -103,7 +103,7 @@ def main() -> None:
                     if press:
                         tab.get_by_role("button", name=press, exact=True).click()
                     tab.wait_for_selector(seen)
-                    told[what] = time.perf_counter() - began
+                    found[what] = time.perf_counter() - began
         finally:
             watched.ending = True
             server.send_signal(signal.SIGINT)
@@ -111,7 +111,7 @@ def main() -> None:
         helpers = max(most for number, most in watched.most.items() if number != server.pid)
         print(
             f"{file.stat().st_size / 1e6:.0f} MB, {ROWS} rows: "
-            + ", ".join(f"{w} {t:.1f} s" for w, t in told.items())
+            + ", ".join(f"{w} {t:.1f} s" for w, t in found.items())
         )
         print(
             f"server {before / 1e6:.0f} MB before, at most "

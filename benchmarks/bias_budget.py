@@ -184,15 +184,15 @@ def look(seed: int) -> Looked:
     for cause, coefficient in made.causes:
         values = coefficient * cause.values(problem.rows.x, problem.layout, problem.outputs)
         true = true + problem.projection.solve(problem.weight.rows(values))
-    terms, told = linearization_of(fit, oa.Training()), []
+    terms, result = linearization_of(fit, oa.Training()), []
     for declared in (tuple(cause for cause, _ in made.causes[:1]), ()):
         tried = (replace(each, enough=LITTLE) for each in terms.considered(declared))
         causes = (explain_learner(terms, each, declared) for each in tried)
         best = next((found for found in causes if found is not None), None)
-        told.append(None if best is None else (best.share, best.moved, best.unsure))
+        result.append(None if best is None else (best.share, best.moved, best.unsure))
     shape = problem.projection.to_coordinates
     return Looked(
-        true, np.asarray(fit.std), fit.theta - made.theta, fit.freedom, shape, tuple(told)
+        true, np.asarray(fit.std), fit.theta - made.theta, fit.freedom, shape, tuple(result)
     )
 
 

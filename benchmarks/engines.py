@@ -195,7 +195,7 @@ def stream_memory(folder: Path, rows: int) -> float:
 
 def on_a_cluster(folder: Path) -> dict[str, float]:
     """A pass on two workers over the same in memory, on one over one thread, and what an iteration costs beside it."""
-    source, told = opened(folder / "1000000.parquet", GROUP), {}
+    source, found = opened(folder / "1000000.parquet", GROUP), {}
     for workers in (2, 1):
         client = connect(None, workers)
         try:
@@ -205,20 +205,20 @@ def on_a_cluster(folder: Path) -> dict[str, float]:
             here = posed(source, Stream())
             if workers == 2:
                 in_memory = fastest(a_pass(OneStepTask.of(here, LEARNER, engine=InMemory())))
-                told["two workers over memory"] = fastest(on_workers) / in_memory
+                found["two workers over memory"] = fastest(on_workers) / in_memory
                 record = witness(source, 2000)
                 small = posed(RecordSource(record, 3, 1000), engine)
-                told["overhead [ms]"] = 1e3 * fastest(
+                found["overhead [ms]"] = 1e3 * fastest(
                     a_pass(OneStepTask.of(small, LEARNER, engine=engine)), 20
                 )
             else:
-                told["one worker over one thread"] = fastest(on_workers) / single_threaded(folder)
+                found["one worker over one thread"] = fastest(on_workers) / single_threaded(folder)
         finally:
             client.close()
             client.cluster.close()
-    for name, value in told.items():
+    for name, value in found.items():
         print(f"Dask, {name}: {value:.3g}")
-    return told
+    return found
 
 
 THREAD = """

@@ -75,8 +75,8 @@ def outcomes(starts: int = STARTS) -> list[Outcome]:
         for segment, washout in SEGMENTATIONS:
             one = outcome(problem, segment, washout, starts)
             found.append(one)
-            told = f"{one.above} of {starts} | {one.best:.3f} | {one.handed_over:.3f}"
-            print(f"| {one.problem} | {one.segment or 'whole'} | {told} |", flush=True)
+            text = f"{one.above} of {starts} | {one.best:.3f} | {one.handed_over:.3f}"
+            print(f"| {one.problem} | {one.segment or 'whole'} | {text} |", flush=True)
     return found
 
 

@@ -82,7 +82,7 @@ def main() -> None:
         joined = {"ORTHAUG_COORDINATOR": f"127.0.0.1:{free_port()}", "ORTHAUG_PROCESSES": "2"}
         began = time.perf_counter()
         both = [started(folder, "devices", **joined, ORTHAUG_PROCESS=str(i)) for i in range(2)]
-        told = [process.communicate()[0].strip().splitlines()[-1] for process in both]
+        output = [process.communicate()[0].strip().splitlines()[-1] for process in both]
         seconds = time.perf_counter() - began
         found = [
             json.loads((folder / kind / "result.json").read_text())
@@ -96,7 +96,7 @@ def main() -> None:
         f"θ apart {np.max(np.abs(thetas[0] / thetas[1] - 1)):.1e}, loss apart "
         f"{abs(losses[0] / losses[1] - 1):.1e}"
     )
-    print(f"the second process said: {told[1]}")
+    print(f"the second process said: {output[1]}")
 
 
 if __name__ == "__main__":

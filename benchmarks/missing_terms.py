@@ -113,7 +113,7 @@ class Outcome(NamedTuple):
 
 @cache
 def outcome(case: Case, draws: int) -> Outcome:
-    told, named, shaped, shares = [], 0, 0, []
+    entries, named, shaped, shares = [], 0, 0, []
     for draw in range(draws):
         learner = oa.MLP((4,), inputs=("v",)) if case.learner else None
         options = {"learner": learner, "blocks": 0, "fallback": False, "seed": draw}
@@ -122,15 +122,15 @@ def outcome(case: Case, draws: int) -> Outcome:
         )
         found = missing_terms(fit)
         if found is None:  # the fit ended nowhere
-            told.append([False] * len(LEVELS))
+            entries.append([False] * len(LEVELS))
             continue
-        told.append([found.p < level for level in LEVELS])
+        entries.append([found.p < level for level in LEVELS])
         best = found.terms[0]
         shares.append(best.share)
         if case.truth is not None and found.p < LEVELS[-1]:
             named += (best.equation, best.variable) == case.truth[:2]
             shaped += (best.equation, best.variable, best.shape) == case.truth
-    parts = tuple(float(100 * share) for share in np.mean(told, axis=0))
+    parts = tuple(float(100 * share) for share in np.mean(entries, axis=0))
     return Outcome(
         parts,
         100 * named / draws,

@@ -119,17 +119,17 @@ def motion_plant() -> Plant:
 def judged(observer: oa.Observer, draw: Draw) -> list[float]:
     """NIS, whether it lies in its interval, whether white at 5 %, coverage of outputs, of measurements, of states."""
     found = observer.run(draw.record)
-    told, (one,) = found.consistency(), found.experiments
+    result, (one,) = found.consistency(), found.experiments
     rows = slice(max(one.start, found.settled), None)
 
     def inside(true: np.ndarray, value: np.ndarray, std: np.ndarray) -> float:
         return float(np.mean(np.abs(true - value)[rows] <= 1.96 * std[rows] + 1e-12))
 
-    white = told.whiteness[0]
+    white = result.whiteness[0]
     states = inside(draw.states, one.states, one.states_std) if found.state_names else np.nan
     return [
-        told.nis,
-        100.0 * told.consistent,
+        result.nis,
+        100.0 * result.consistent,
         100.0 * (white is not None and white.p > 0.05),
         100 * inside(draw.outputs, one.outputs, one.outputs_std),
         100 * inside(one.measured, one.predicted, one.predicted_std),

@@ -58,7 +58,7 @@ def equal() -> list[float]:
 def drift(draws: int = 20) -> list[float]:
     """Mass grows by 20 %: per memory [s] median and largest error of m along it, share with an alarm; per cent."""
     mass = np.linspace(MASS, 1.2 * MASS, ROWS)
-    told = []
+    entries = []
     for memory in (0.5, 1.0, 2.0, 5.0):
         errors, alarms = [], 0
         for draw in range(draws):
@@ -66,17 +66,17 @@ def drift(draws: int = 20) -> list[float]:
             alarms += bool(online.update(Plant(m=mass).record(20_000 + draw)))
             course = online.physical_history(physics(), points=60)
             errors.append(100 * np.abs(course.m / mass[course.index] - 1))
-        told += [memory, float(np.median(errors)), float(np.max(errors)), 100 * alarms / draws]
+        entries += [memory, float(np.median(errors)), float(np.max(errors)), 100 * alarms / draws]
         print(
-            f"memory {memory} s: error of m {told[-3]:.2f} % median, {told[-2]:.2f} % largest; "
-            f"alarms {told[-1]:.0f} %"
+            f"memory {memory} s: error of m {entries[-3]:.2f} % median, {entries[-2]:.2f} % largest; "
+            f"alarms {entries[-1]:.0f} %"
         )
-    return told
+    return entries
 
 
 def friction(draws: int = DRAWS) -> list[float]:
     """Friction steps up: share detected, median and largest delay [s], share detected within 2 s, in per cent."""
-    told = []
+    entries = []
     for step in (1.2, 1.5, 2.0):
         for memory in (None, MEMORY):
             delays = []
@@ -88,33 +88,33 @@ def friction(draws: int = DRAWS) -> list[float]:
                 delays.append(after[0] if after else np.inf)
             seen, soon = (100 * np.mean(np.array(delays) <= end) for end in (1e9, 2.0))
             found = [d for d in delays if np.isfinite(d)] or [np.nan]
-            told += [float(np.median(found)), float(np.max(found)), float(soon), float(seen)]
+            entries += [float(np.median(found)), float(np.max(found)), float(soon), float(seen)]
             which = "forgets nothing" if memory is None else f"memory {memory} s"
-            print(f"friction +{100 * (step - 1):.0f} %, {which}: {told[-4]:.2f} s median, "
-                f"{told[-3]:.2f} s largest, {soon:.1f} % within 2 s, {seen:.1f} % at all")  # fmt: skip
-    return told
+            print(f"friction +{100 * (step - 1):.0f} %, {which}: {entries[-4]:.2f} s median, "
+                f"{entries[-3]:.2f} s largest, {soon:.1f} % within 2 s, {seen:.1f} % at all")  # fmt: skip
+    return entries
 
 
 def quiet(draws: int = DRAWS) -> list[float]:
     """Records without a change that raise an alarm, in per cent."""
-    told = []
+    entries = []
     for case, options in CASES.items():
         for memory in (None, MEMORY):
             raised = 0
             for draw in range(draws):
                 online = oa.Recursive(fit_of(draw, case), memory=memory)
                 raised += bool(online.update(Plant(**options).record(40_000 + draw)))
-            told.append(100 * raised / draws)
+            entries.append(100 * raised / draws)
             print(
-                f"no change, noise {case}, memory {memory}: {told[-1]:.1f} % of {draws} "
+                f"no change, noise {case}, memory {memory}: {entries[-1]:.1f} % of {draws} "
                 "records raise an alarm"
             )
-    return told
+    return entries
 
 
 def coverage(draws: int = DRAWS) -> list[float]:
     """95 % intervals of m and k that hold the truth at the end of a record without a change, in per cent."""
-    told = []
+    entries = []
     for case, options in CASES.items():
         for memory in (None, MEMORY):
             hits = []
@@ -124,12 +124,12 @@ def coverage(draws: int = DRAWS) -> list[float]:
                 told_now = dict(zip(("m", "c", "ks"), online.physical(physics()).ci95, strict=True))
                 hits.append([low <= truth <= high for truth, (low, high) in
                              ((MASS, told_now["m"]), (100.0, told_now["ks"]))])  # fmt: skip
-            told += (100 * np.mean(hits, axis=0)).tolist()
+            entries += (100 * np.mean(hits, axis=0)).tolist()
             print(
-                f"noise {case}, memory {memory}: intervals of m hold it in {told[-2]:.1f} %, "
-                f"of k in {told[-1]:.1f} %"
+                f"noise {case}, memory {memory}: intervals of m hold it in {entries[-2]:.1f} %, "
+                f"of k in {entries[-1]:.1f} %"
             )
-    return told
+    return entries
 
 
 def directional(
@@ -154,7 +154,7 @@ def windup(draws: int = 20) -> list[float]:
     rows = 5000
     mass = np.linspace(MASS, 1.2 * MASS, rows)
     rest = np.where((np.arange(rows) >= 1000) & (np.arange(rows) < 4000), 0.0, 1.0)
-    told = []
+    entries = []
     for name, floor in (
         ("none", 0.0),
         ("0.01", 0.01),
@@ -182,12 +182,12 @@ def windup(draws: int = 20) -> list[float]:
                     course = online.history[["theta1", "theta2", "theta3"]].to_numpy()
                 error = 100 * np.abs(TS**2 / course[:, 2] / truth[-len(course) :] - 1)
                 kept.append(error[1000:4100].max() if kept is idle else np.median(error))
-        told += [float(np.median(idle)), float(np.max(idle)), float(np.median(slow))]
+        entries += [float(np.median(idle)), float(np.max(idle)), float(np.median(slow))]
         print(
-            f"floor {name}: without force {told[-3]:.2f} % median, {told[-2]:.2f} % largest; "
-            f"drift {told[-1]:.2f} %"
+            f"floor {name}: without force {entries[-3]:.2f} % median, {entries[-2]:.2f} % largest; "
+            f"drift {entries[-1]:.2f} %"
         )
-    return told
+    return entries
 
 
 def times() -> list[float]:

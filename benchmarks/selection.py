@@ -208,10 +208,10 @@ def level(draws: int = 2000) -> dict[str, float]:
     """% of linear records with true orders for which something nonlinear is said to be missing, at the level of 5 %."""
     found = {}
     for kind in ("equation", "sensor"):
-        told = [
+        result = [
             _tested(number, linear_record(number, kind, 30, 600, 66)) for number in range(draws)
         ]
-        found[f"{kind} noise"] = 100 * float(np.mean(told))
+        found[f"{kind} noise"] = 100 * float(np.mean(result))
     return found
 
 
@@ -227,7 +227,7 @@ def power(draws: int = 100) -> dict[str, float]:
     """% of records with a cubic term of some size, by its share of the output's deviation in %, that are told."""
     found = {}
     for share in (0.0, 0.5, 1.0, 2.0, 4.0):
-        told = []
+        entries = []
         for draw in range(draws):
             rng = np.random.default_rng([draw, 31])
             u, e = rng.normal(size=700), 0.03 * rng.normal(size=700)
@@ -236,8 +236,8 @@ def power(draws: int = 100) -> dict[str, float]:
                 y[k] = 0.7 * y[k - 1] + u[k - 1] + share / 100 * 0.35 * u[k - 1] ** 3 + e[k]
             problem = pose(oa.Record.from_arrays(u=u[100:], y=y[100:]), PHYSICS)
             tested = nonlinearity(problem, ["y[k-1]", "u[k-1]"], 499)
-            told.append(tested is not None and tested.found)
-        found[f"{share:g} %"] = 100 * float(np.mean(told))
+            entries.append(tested is not None and tested.found)
+        found[f"{share:g} %"] = 100 * float(np.mean(entries))
     return found
 
 

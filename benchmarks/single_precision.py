@@ -106,8 +106,8 @@ def main() -> None:
         apart = np.max(np.abs(thetas[1] - thetas[0]) / np.abs(thetas[0]))
         losses = [float(end.normal.loss) for end in ends]
         steps = " / ".join(str(end.iterations) for end in ends)
-        told = f"{1e3 * double:.0f} ms | {1e3 * single:.0f} ms | {double / single:.2f} | {steps}"
-        print(f"| {rows} | {size} | {told} | {losses[1] / losses[0] - 1:.1e} | {apart:.1e} |")
+        text = f"{1e3 * double:.0f} ms | {1e3 * single:.0f} ms | {double / single:.2f} | {steps}"
+        print(f"| {rows} | {size} | {text} | {losses[1] / losses[0] - 1:.1e} | {apart:.1e} |")
 
 
 if __name__ == "__main__":

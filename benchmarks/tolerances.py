@@ -73,8 +73,8 @@ def main() -> None:
     print(describe())
     print(f"| tolerance | {' | '.join(f'{name}, {kind}' for name, kind in CASES)} |\n{6 * '|---'}|")
     for tolerance, cells in zip(TOLERANCES, rows(), strict=True):
-        told = (f"{rmse:.3g}, {iterations:.0f}" for rmse, iterations in cells)
-        print(f"| {tolerance:.0e} | {' | '.join(told)} |", flush=True)
+        found = (f"{rmse:.3g}, {iterations:.0f}" for rmse, iterations in cells)
+        print(f"| {tolerance:.0e} | {' | '.join(found)} |", flush=True)
     print(
         f"\nA first damping of {STRONG:.0e} takes {first_damping():.0f} % more iterations than "
         f"{WEAK:.0e}."

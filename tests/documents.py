@@ -96,11 +96,11 @@ def blocks_of(path: Path) -> list[Block]:
     name = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
     for first, text in given.BESIDE.get(name, {}).items():
         (block,) = (one for one in found if one.text.startswith(first))
-        kind, _, told = text.partition(": ")
+        kind, _, result = text.partition(": ")
         if kind == "given":
-            block.given += told.split(", ")
+            block.given += result.split(", ")
         else:
-            block.not_run = told
+            block.not_run = result
     return found
 
 
@@ -219,10 +219,10 @@ class Page:
         return ""
 
     def commanded(self, block: Block) -> Iterator[str]:
-        told = list(commands(block))
-        for i, (line, expected) in enumerate(told):
+        found = list(commands(block))
+        for i, (line, expected) in enumerate(found):
             code, printed = shell(line)
-            wanted = block.exits if i == len(told) - 1 else 0
+            wanted = block.exits if i == len(found) - 1 else 0
             assert code == wanted, (
                 f"{self.path.name}:{block.line}: `{line}` ends with {code}\n{printed}"
             )

@@ -154,14 +154,14 @@ def test_lbfgs_goes_on_from_adam(structure):
 
 def test_the_loss_never_rises_under_lbfgs(monkeypatch):
     monkeypatch.setattr(adam_lbfgs, "burst_length", lambda burst, spent: 1)
-    told = []
+    entries = []
     fit(
         Additive(),
         AdamLBFGS(0, 40),
-        progress=lambda run, iteration, loss: told.append((iteration, loss)),
+        progress=lambda run, iteration, loss: entries.append((iteration, loss)),
     )
-    iterations, losses = zip(*told, strict=True)
-    assert iterations == tuple(range(1, len(told) + 1))
+    iterations, losses = zip(*entries, strict=True)
+    assert iterations == tuple(range(1, len(entries) + 1))
     assert np.all(np.diff(losses) <= 0)
 
 

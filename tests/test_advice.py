@@ -115,17 +115,17 @@ def test_the_right_term_is_advised_with_its_figure_in_text_page_and_numbers(tmp_
     code, out, _ = orthaug("fit", spec, "--out", tmp_path / "out")
     printed = unfolded(out)
     assert code == 0
-    told = json.loads((tmp_path / "out/result.json").read_text())
-    term = next(a for a in told["advice"] if "the term sign(v[k-1]) in the physics" in a["text"])
+    result = json.loads((tmp_path / "out/result.json").read_text())
+    term = next(a for a in result["advice"] if "the term sign(v[k-1]) in the physics" in a["text"])
     assert term["after"] < 0.5 * term["before"]
     assert errors(term["text"]) == pytest.approx((term["before"], term["after"]), rel=5e-3)
     assert term["change"]["baseline.terms"][-1] == {
         "parameter": "size",
         "regressor": "sign(v[k-1])",
     }
-    assert told["advice"] == sorted(told["advice"], key=lambda a: a["after"])
-    first = told["advice"][0]["text"]
-    assert f"Next: {first}" in printed and told["advice_trials"]["text"] in printed
+    assert result["advice"] == sorted(result["advice"], key=lambda a: a["after"])
+    first = result["advice"][0]["text"]
+    assert f"Next: {first}" in printed and result["advice_trials"]["text"] in printed
     assert first in html.unescape((tmp_path / "out/report.html").read_text())
 
 
@@ -192,10 +192,10 @@ def test_what_the_spec_has_is_never_advised(tmp_path):
         str(put(tmp_path, text + suspect("coulomb", "v[k-1]"), driven(with_friction, 400)))
     )
     trials = "" if fitted.result.advice_trials is None else fitted.result.advice_trials.text
-    told = " ".join(
+    found = " ".join(
         [a.text for a in fitted.result.advice] + [trials, fit_verdict(fitted.result).then]
     )
-    assert "sign(" not in told and "also sees" not in told and "focus" not in told
+    assert "sign(" not in found and "also sees" not in found and "focus" not in found
 
 
 def test_a_term_is_the_whole_term():
@@ -257,12 +257,12 @@ def test_a_motion_is_not_advised_the_hold_or_the_learner_input_that_it_has(moved
     )
     text += "[validation]\nblocks = 0\n"
     fitted = oa.fit_spec(str(put(tmp_path, text, friction(300, 3), "force,position")))
-    told = [
+    found = [
         fit_verdict(fitted.result).then,
         *(a.text for a in fitted.result.advice),
         *(w.text for w in fitted.result.warnings),
     ]
-    assert not any("sees v" in text or "learner see" in text for text in told)
+    assert not any("sees v" in text or "learner see" in text for text in found)
 
 
 TANK = """

@@ -97,8 +97,8 @@ def answer(gate: Gate, kind: str = "http", **given: Any) -> tuple[int, dict[str,
     }
     asyncio.run(gate(scope, None, send))  # type: ignore[arg-type]
     first = sent[0] if sent else {}
-    told = {k.decode(): v.decode() for k, v in first.get("headers", [])}
-    return first.get("status", first.get("code", 0)), told, bool(reached)
+    found = {k.decode(): v.decode() for k, v in first.get("headers", [])}
+    return first.get("status", first.get("code", 0)), found, bool(reached)
 
 
 def test_only_the_token_opens_the_gate():
@@ -130,11 +130,11 @@ def test_only_the_token_opens_the_gate():
         assert answer(
             gate, kind, headers=kept | {"host": "localhost:8123", "origin": "http://localhost:8123"}
         )[2]
-    code, told, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
-    assert (code, told["location"], reached) == (303, "/evil.example/x?show=true", False)
-    _, told, _ = answer(gate, query="token=sesame", path="/\\evil.example/\r\nx: y")
-    assert told["location"] == "/%5Cevil.example/%0D%0Ax%3A%20y"
-    assert "HttpOnly" in told["set-cookie"] and "SameSite=Strict" in told["set-cookie"]
+    code, found, reached = answer(gate, query="token=sesame&show=true", path="//evil.example/x")
+    assert (code, found["location"], reached) == (303, "/evil.example/x?show=true", False)
+    _, found, _ = answer(gate, query="token=sesame", path="/\\evil.example/\r\nx: y")
+    assert found["location"] == "/%5Cevil.example/%0D%0Ax%3A%20y"
+    assert "HttpOnly" in found["set-cookie"] and "SameSite=Strict" in found["set-cookie"]
     assert "frame-ancestors 'self'" in answer(gate, headers=kept)[1]["content-security-policy"]
     assert len(Gate(None, 1).token) > 40 and Gate(None, 1).token != Gate(None, 1).token  # type: ignore[arg-type]
 
@@ -378,8 +378,8 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
     lines = [
         json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")
     ]
-    told = [Run.of(line) for line in lines]
-    assert told == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
+    found = [Run.of(line) for line in lines]
+    assert found == [Run(2, "orthogonal", 2, "none"), Run(6, "baseline-penalty", 2, "none"), Run(9)]
 
 
 def test_lines_of_progress_name_the_stages_after_the_runs(monkeypatch, capsys):
@@ -541,17 +541,17 @@ def test_the_form_shows_the_focus_that_training_takes():
 @served
 def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path, monkeypatch):
     session = Session("key", tmp_path, WorkerPool())
-    page, told, seen = routes.Page(session), [], []
-    monkeypatch.setattr(page, "_complain", told.append)
+    page, found, seen = routes.Page(session), [], []
+    monkeypatch.setattr(page, "_complain", found.append)
     monkeypatch.setattr(page, "_name", lambda: None)
     monkeypatch.setattr(page.data, "follow_data", lambda: 1 / 0)
     monkeypatch.setattr(page.model, "follow_data", lambda: seen.append("model"))
     monkeypatch.setattr(page.training, "follow_work", lambda: seen.append("training"))
     session.mark_changed("data")
     page.follow()
-    assert [type(error) for error in told] == [ZeroDivisionError] and seen == ["model", "training"]
+    assert [type(error) for error in found] == [ZeroDivisionError] and seen == ["model", "training"]
     page.follow()
-    assert len(told) == 1
+    assert len(found) == 1
 
 
 def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
@@ -827,8 +827,8 @@ class Server:
     def end(self) -> str:
         """What it said on standard error, after Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
-        _, told = self.process.communicate(timeout=20)
-        return told
+        _, found = self.process.communicate(timeout=20)
+        return found
 
 
 @pytest.fixture(scope="module")
@@ -1576,8 +1576,8 @@ def test_ctrl_c_leaves_nothing(serve, browser, csv, tmp_path):
     tab.page.wait_for_selector("text=reading and compiling")
     children = server.children()
     assert len(children) >= 2
-    told = server.end()
-    assert (server.process.returncode, told) == (0, "ended\n")
+    found = server.end()
+    assert (server.process.returncode, found) == (0, "ended\n")
     assert [number for number in children if Path(f"/proc/{number}").exists()] == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["plant.toml"]
     tab.leave()

@@ -343,10 +343,10 @@ def test_a_bound_leaves_the_others_as_a_fixed_term_does(ny, criterion):
 def test_what_the_learner_could_imitate_is_told_of_the_others():
     given, baseline, learner = heated()
     fit = estimate(given, baseline, learner=learner, **OPTIONS)
-    told = imitation(fit.problem, others=False, held=tuple(fit.at_bound))
-    assert told.determined == ("gain1",) and told.directions == () and not fit.model.shared.size
-    assert told.text.startswith("loss1 is at a bound: the orthogonal split does not move it.")
-    assert "imitate nothing of the other physics" in told.text
+    found = imitation(fit.problem, others=False, held=tuple(fit.at_bound))
+    assert found.determined == ("gain1",) and found.directions == () and not fit.model.shared.size
+    assert found.text.startswith("loss1 is at a bound: the orthogonal split does not move it.")
+    assert "imitate nothing of the other physics" in found.text
     (warning,) = (str(text) for text in fit.warnings if text.code == "at_a_bound")
     assert "is a known term" in warning and "the learner is not made orthogonal to it" in warning
 

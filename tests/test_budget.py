@@ -112,12 +112,12 @@ def test_the_papers_data_sets():
         fit = estimate(example.train, example.baseline, solver=LevenbergMarquardt(60))
         found = bias_budget(fit)
         assert found is not None and found.cause.suspect.name == "u[k]**2" and found.share > 0.95
-        told = np.array([entry.value for entry in found.parameters])
+        result = np.array([entry.value for entry in found.parameters])
         error = fit.theta - example.theta
         if number == 1:
-            assert not found.warnings and np.abs(told).max() < 1e-12
+            assert not found.warnings and np.abs(result).max() < 1e-12
             continue
-        assert np.linalg.norm(told - error) < 0.12 * np.linalg.norm(error)
+        assert np.linalg.norm(result - error) < 0.12 * np.linalg.norm(error)
         for entry, truth in zip(found.parameters, example.theta, strict=True):
             assert entry.ci95 is not None and entry.ci95[0] <= truth <= entry.ci95[1]
         (warning,) = found.warnings
@@ -299,9 +299,9 @@ def test_no_cause_no_bias():
 
 def test_a_missing_lag_is_named():
     fits = [system(text, noise=0.05) for text in ("u[k-1]**2", f"({VELOCITY})**3")]
-    told, fine = map(missing_lags, fits)
-    assert told is not None and told.missing[0].lag == "u[k-1]" and told.missing[0].p < 1e-10
-    assert told.warnings[0].code == "missing_lag" and "u[k-1] explains" in told.text
+    found, fine = map(missing_lags, fits)
+    assert found is not None and found.missing[0].lag == "u[k-1]" and found.missing[0].p < 1e-10
+    assert found.warnings[0].code == "missing_lag" and "u[k-1] explains" in found.text
     assert fine is not None and not fine.missing and not fine.warnings
     assert [test.lag for test in fine.tests] == ["y[k-1]", "y[k-2]", "u[k-1]"]
     assert (

@@ -192,10 +192,10 @@ def test_a_change_in_words():
         str(criterion)
         == 'with focus = "simulation" the error of its free run is predicted to fall by 12 %'
     )
-    told = str(Change("criterion", "simulation", 0.0, "simulation"))
+    text = str(Change("criterion", "simulation", 0.0, "simulation"))
     assert (
-        told.startswith('with focus = "simulation" the parameters would not have this bias')
-        and "%" not in told
+        text.startswith('with focus = "simulation" the parameters would not have this bias')
+        and "%" not in text
     )
-    assert "not predicted to fall" in told
+    assert "not predicted to fall" in text
     assert Change("offset", "1", 0.2, "prediction", "y2").name == "an offset in the physics of y2"

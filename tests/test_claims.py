@@ -69,10 +69,10 @@ def test_every_anchor_names_a_function_and_numbers() -> None:
 
 
 def test_every_command_of_a_number_that_depends_on_the_machine_exists() -> None:
-    told = [
+    found = [
         text for block in claims.all_blocks() for kind, text in block.anchors if kind == "machine"
     ]
-    files = {file for text in told for file in re.findall(r"[\w/]+\.(?:py|toml)", text)}
+    files = {file for text in found for file in re.findall(r"[\w/]+\.(?:py|toml)", text)}
     assert len(files) > 4
     assert {file for file in files if not (ROOT / file).is_file()} == set()
 

@@ -674,10 +674,10 @@ def test_responses_have_a_row_per_data_row_and_the_library_s_numbers(
     np.testing.assert_array_equal(frame["y_learner"], response.trajectories[0].learner[:, 0])
     np.testing.assert_array_equal(frame["y"], record.experiments[0].outputs[:, 0])
     assert (tmp_path / "out.csv").read_text().splitlines()[1].endswith(",,,")
-    told, scored, scores = done.out.splitlines(), f"{60 - first} rows", response.scores()
-    assert scored in told[0] and told[2] == f"written to {tmp_path / 'out.csv'}"
+    output, scored, scores = done.out.splitlines(), f"{60 - first} rows", response.scores()
+    assert scored in output[0] and output[2] == f"written to {tmp_path / 'out.csv'}"
     rmse, nrmse, percent = (f"{v[0]:.6g}" for v in (scores.rmse, scores.nrmse, scores.fit))
-    assert told[1].split() == ["y", rmse, "m", nrmse, percent]
+    assert output[1].split() == ["y", rmse, "m", nrmse, percent]
     assert listing(tmp_path) == ["out.csv"]
 
 

@@ -376,10 +376,10 @@ def test_a_suspect_without_effect_is_told_of(project):
     report = result_of(
         project, MACHINE + suspects('on = "0*force[k-1]"', 'kind = "offset"'), "check"
     )
-    told = [entry["name"] for entry in report["bias"]] + [
+    found = [entry["name"] for entry in report["bias"]] + [
         warning["text"] for warning in report["warnings"]
     ]
-    assert any("0*force[k-1]" in text for text in told)
+    assert any("0*force[k-1]" in text for text in found)
 
 
 def test_physics_without_parameters_has_no_bias_table(project):

@@ -161,9 +161,11 @@ def test_one_step_with_sensor_noise_is_told(tmp_path):
     spec = project(tmp_path / "p", ALONE, QUICK, **system(0, 600, sensor=0.3))
     printed, result = printed_fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
-    told = [w["text"] for w in result["warnings"]]
-    assert any("intervals do not cover" in text and 'focus = "simulation"' in text for text in told)
-    assert result["residuals"]["text"] in unfolded(printed) and f"warning: {told[0]}" in unfolded(
+    found = [w["text"] for w in result["warnings"]]
+    assert any(
+        "intervals do not cover" in text and 'focus = "simulation"' in text for text in found
+    )
+    assert result["residuals"]["text"] in unfolded(printed) and f"warning: {found[0]}" in unfolded(
         printed
     )
 
@@ -263,10 +265,10 @@ def test_a_free_run_that_diverges_is_null_with_a_warning(diverged):
         "fit": None,
     }
     assert diverged["scores"]["tests.far"]["prediction"]["rmse"][0] > 0
-    told = [w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged"]
+    warnings = [w["text"] for w in diverged["warnings"] if w["code"] == "free_run_diverged"]
     assert any(
         re.match(r"tests\.far: the free run diverged in output 'y' at step \d+", text)
-        for text in told
+        for text in warnings
     )
 
 
@@ -359,10 +361,10 @@ def test_compare_shows_the_verdicts_of_every_row(compared):
         if name == "physics alone":
             assert row["validation"] is None
         else:
-            (told,) = (
+            (output,) = (
                 line for line in text.splitlines() if line.startswith(f"{name}: The learner")
             )
-            assert row["validation"]["text"].startswith(told.removeprefix(f"{name}: "))
+            assert row["validation"]["text"].startswith(output.removeprefix(f"{name}: "))
             wheres = [trial["where"] for trial in row["validation"]["trials"]]
             assert wheres == ["tests.far"]  # as in `fit`: blocks only where no part is held out
 

@@ -208,8 +208,8 @@ def test_a_row_with_other_parameters_has_its_own_columns(compared):
     result = CompareResult.model_validate(content)
     head, *rows = _parameter_cells(result)
     assert head[1:5] == ["a", "b", "c", "gain"] and {len(row) for row in rows} == {len(head)}
-    told = dict(zip(head, rows[-1], strict=True))
-    assert (told["a"], told["b"], told["gain"], told["weights"]) == (
+    found = dict(zip(head, rows[-1], strict=True))
+    assert (found["a"], found["b"], found["gain"], found["weights"]) == (
         "–",
         "–",
         "0.25",

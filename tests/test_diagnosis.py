@@ -335,18 +335,18 @@ def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
         e[k] = 0.9 * e[k - 1] + 0.02 * rng.normal()
         y[k] = 1.5 * y[k - 1] - 0.7 * y[k - 2] + u[k - 1] + e[k]
     one, two = (of(Record.from_arrays(u, y), criterion=c) for c in (Prediction(), Simulation()))
-    told = dict(one.warnings)["inconsistent"]
+    found = dict(one.warnings)["inconsistent"]
     assert (
-        "one-step θ is inconsistent" in told
-        and "standard errors away" in told
-        and 'focus = "simulation"' in told
+        "one-step θ is inconsistent" in found
+        and "standard errors away" in found
+        and 'focus = "simulation"' in found
     )
     compared = tuple(Candidate(focus, False, 0.3) for focus in ("prediction", "simulation"))
     fit = estimate(Record.from_arrays(u, y), PHYSICS, learner=None, criterion=Prediction())
     after = diagnose(replace(fit, focus=Focus("prediction", "", compared)))
-    told = dict(after.warnings)["inconsistent"]  # the free run was no better: not advised again
-    assert 'focus = "simulation"' not in told
-    assert 'a noise model ([noise] model = "auto"): training on the free run was tried' in told
+    found = dict(after.warnings)["inconsistent"]  # the free run was no better: not advised again
+    assert 'focus = "simulation"' not in found
+    assert 'a noise model ([noise] model = "auto"): training on the free run was tried' in found
     assert not any("one-step θ" in warning.text for warning in two.warnings)
     assert of(second_order(0, equation=0.1)).warnings == ()
 

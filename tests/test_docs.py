@@ -190,15 +190,15 @@ def test_every_name_of_the_code_is_a_word_of_the_code(page):
 
 
 def test_every_numbered_fact_is_told():
-    told = re.findall(r"^\| (F\d+) \|", TEXTS["docs/guide/theory.md"], re.MULTILINE)
+    names = re.findall(r"^\| (F\d+) \|", TEXTS["docs/guide/theory.md"], re.MULTILINE)
     texts = [*TEXTS.values(), *(file.read_text(encoding="utf-8") for file in SOURCE.rglob("*.py"))]
     named = set(re.findall(r"[(\s](F\d{1,2})[),:.\s]", " ".join(texts)))
-    assert told == [f"F{i + 1}" for i in range(12)] and named - set(told) == set()
+    assert names == [f"F{i + 1}" for i in range(12)] and named - set(names) == set()
 
 
 def test_the_rooms_are_told_in_their_order():
-    told = tuple(re.findall(r"^\| `(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE))
-    assert told == ROOMS
+    names = tuple(re.findall(r"^\| `(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE))
+    assert names == ROOMS
     assert " ← ".join(f"`{room}`" for room in ROOMS) in TEXTS["docs/decisions/rooms.md"]
 
 

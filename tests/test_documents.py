@@ -83,8 +83,8 @@ def test_every_public_name_is_in_the_reference():
     public = re.findall(
         r"^from \.[\w.]+ import (\w+) as \1$", (SOURCE / "__init__.pyi").read_text(), re.MULTILINE
     )
-    told = re.findall(r"^::: orthaug\.(\w+)$", REFERENCE, re.MULTILINE)
-    assert sorted(told) == sorted(public) and len(public) > 80
+    names = re.findall(r"^::: orthaug\.(\w+)$", REFERENCE, re.MULTILINE)
+    assert sorted(names) == sorted(public) and len(public) > 80
 
 
 def test_what_functions_return_is_in_the_reference():
@@ -117,8 +117,8 @@ def test_what_functions_return_is_in_the_reference():
         "Job",
         "FitReport",
     } <= returned and "SuspectedBias" in held
-    told = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
-    assert (returned | held) - set(told) == set()
+    names = re.findall(r"^::: orthaug\.(?:[\w.]+\.)?(\w+)$", REFERENCE, re.MULTILINE)
+    assert (returned | held) - set(names) == set()
     assert {
         "PhysicalEstimate",
         "Observations",
@@ -126,7 +126,7 @@ def test_what_functions_return_is_in_the_reference():
         "Alarm",
         "FitPlots",
         "Page",
-    } <= set(told)
+    } <= set(names)
     for shown in ("Estimate", "MotionEstimate"):
         assert re.search(
             rf"^::: orthaug\.{shown}\n    options: .*plot, report", REFERENCE, re.MULTILINE
@@ -177,8 +177,8 @@ def test_pages_have_pictures_that_are_small_and_described():
 
 def test_every_page_is_in_the_navigation():
     nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
-    told = set(re.findall(r"[\w/]+\.md\b", nav))
-    assert {name.removeprefix("docs/") for name in PAGES if name != "README.md"} <= told
+    names = set(re.findall(r"[\w/]+\.md\b", nav))
+    assert {name.removeprefix("docs/") for name in PAGES if name != "README.md"} <= names
 
 
 def test_every_warning_has_a_row_with_a_remedy():

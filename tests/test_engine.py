@@ -283,15 +283,17 @@ def test_adam_needs_rows_in_memory():
 
 
 def test_progress_is_told_as_a_mean_square():
-    told = []
+    entries = []
     options = {
         "learner": MLP(hidden=(3,)),
         "solver": LevenbergMarquardt(6),
         "regularization": "none",
     }
-    found = fit(posed(1), engine=Streaming(), progress=lambda *at: told.append(at), **options)
-    assert [(run, n) for run, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
-    assert told[-1][2] == pytest.approx(found.status.loss, rel=1e-9)
+    found = fit(posed(1), engine=Streaming(), progress=lambda *at: entries.append(at), **options)
+    assert [(run, n) for run, n, _ in entries] == [
+        (0, n + 1) for n in range(found.status.iterations)
+    ]
+    assert entries[-1][2] == pytest.approx(found.status.loss, rel=1e-9)
 
 
 def test_a_trial_is_one_pass_over_the_rows():

@@ -132,8 +132,8 @@ def check_same(found, expected):
             for key in ("std", "plain_std", "ci95", "ci95_with_bias"):
                 parameter[key] = other.get(key)
         left_out += ["/standard_errors", "/warnings"]  # warnings count biases in standard errors
-    told = [d for d in differences(found, expected) if not d.startswith(tuple(left_out))]
-    assert told == [], "\n".join(told)
+    result = [d for d in differences(found, expected) if not d.startswith(tuple(left_out))]
+    assert result == [], "\n".join(result)
 
 
 CASES = [("orthogonal", '"none"'), ("additive", "0.1"), ("orthogonal-penalty", '"evidence"'),

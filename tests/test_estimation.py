@@ -407,7 +407,7 @@ def test_warm_start_with_other_physics(record, short):
 
 
 def test_progress_is_told(record):
-    told = []
+    entries = []
     solver = LevenbergMarquardt(iterations=6)
     found = estimate(
         record,
@@ -415,11 +415,11 @@ def test_progress_is_told(record):
         learner=NETWORK,
         solver=solver,
         restarts=2,
-        progress=lambda *what: told.append(what),
+        progress=lambda *what: entries.append(what),
     )
-    assert {restart for restart, _, _ in told} == {0, 1, 2, 3}  # none and ard from each start
+    assert {restart for restart, _, _ in entries} == {0, 1, 2, 3}  # none and ard from each start
     for i, run in enumerate(found.restarts):
-        _, iteration, loss = [what for what in told if what[0] == i][-1]
+        _, iteration, loss = [what for what in entries if what[0] == i][-1]
         assert iteration == run.iterations and loss == pytest.approx(run.loss, rel=1e-12)
 
 
@@ -441,13 +441,13 @@ def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
     moved = Orthogonal(measure=oa.Symmetrized())
     record, options = record_of(), {"learner": NETWORK, "solver": solver, "regularization": "none"}
     found = estimate(record, PHYSICS, structure=moved, **options)
-    told = {warning.code: warning.text for warning in found.warnings}
+    result = {warning.code: warning.text for warning in found.warnings}
     assert found.status.code == "iteration_limit" and found.std is None
     assert (
         "no intervals: training ended after 6 iterations while the loss was still falling"
-        in told["not_converged"]
+        in result["not_converged"]
     )
-    assert "Without the key `iterations`, training continues" in told["not_converged"]
+    assert "Without the key `iterations`, training continues" in result["not_converged"]
     flown = estimate(record, PHYSICS, criterion=oa.Simulation(30, 0), **options | {"blocks": 0})
     assert flown.std is None and "not_converged" in {warning.code for warning in flown.warnings}
 
@@ -455,11 +455,11 @@ def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
 def test_a_learner_that_was_regularised_to_nothing_says_so():
     options = {"learner": NETWORK, "solver": LevenbergMarquardt(20)}
     silent = estimate(record_of(), PHYSICS, regularization=1e9, **options)
-    told = {warning.code: warning.text for warning in silent.warnings}
+    found = {warning.code: warning.text for warning in silent.warnings}
     assert silent.effective_weights < 0.5
     assert re.search(
         r"the learner contributes nothing: the fit is that of physics alone .*Compare",
-        told["learner_silent"],
+        found["learner_silent"],
     )
     heard = estimate(record_of(), PHYSICS, regularization="none", **options)
     assert "learner_silent" not in {warning.code for warning in heard.warnings}
@@ -475,8 +475,10 @@ def test_who_is_told_can_say_that_it_is_enough(record, solver):
     found = estimate(record, PHYSICS, learner=NETWORK, solver=solver, restarts=2, progress=enough)
     assert found.status.code == "stopped" and found.status.ok and found.status.iterations == 1
     assert found.status.loss <= found.status.start_loss or not solver.gauss_newton
-    told = next(warning.text for warning in found.warnings if warning.code == "stopped")
-    assert re.match(r"training was stopped on request: (\d) of \1 runs had not ended", told), told
+    result = next(warning.text for warning in found.warnings if warning.code == "stopped")
+    assert re.match(r"training was stopped on request: (\d) of \1 runs had not ended", result), (
+        result
+    )
 
 
 def test_converged(record):

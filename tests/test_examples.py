@@ -36,11 +36,13 @@ def test_predictive_control_by_the_learned_model_tracks_better(tmp_path):
 def test_the_c_loop_is_the_model(tmp_path, capsys):
     found = importlib.import_module("c_loop").main(str(tmp_path))
     assert found["double"] < 1e-12 and 1e-12 < found["float"] < 1e-5
-    told = capsys.readouterr().out
-    assert re.search(r"1 kHz for a second: a step takes \d+\.\d+ µs|needs the clock of Linux", told)
-    built = re.search(r"Cortex-M4, single precision: \d+ bytes.*; ([\d,]+) instructions", told)
+    output = capsys.readouterr().out
+    assert re.search(
+        r"1 kHz for a second: a step takes \d+\.\d+ µs|needs the clock of Linux", output
+    )
+    built = re.search(r"Cortex-M4, single precision: \d+ bytes.*; ([\d,]+) instructions", output)
     assert built is None or 100 < int(built[1].replace(",", "")) < 10_000
-    assert built or "not compiled for a microcontroller" in told or "not counted" in told
+    assert built or "not compiled for a microcontroller" in output or "not counted" in output
     assert (tmp_path / "c" / "plant.c").exists()
 
 

@@ -78,17 +78,17 @@ def hardening() -> oa.Estimate:
 
 
 def test_a_cubic_is_found_with_its_coefficient_and_theta(hardening):
-    told = oa.explain(hardening)
-    (term,) = told.terms
+    found = oa.explain(hardening)
+    (term,) = found.terms
     assert term.expression == "y[k-1]**3" and term.unit == "1/m**2" and term.added_to == "y"
     assert (
         term.coefficient == pytest.approx(-0.3, rel=0.03)
         and abs(term.coefficient + 0.3) < 4 * term.std
     )
-    assert told.share > 0.95 and term.alone == pytest.approx(told.share)
-    assert told.p < 1e-6 and told.noise < 0.05
-    now = {moved.name: moved.value for moved in told.parameters}
-    then = {moved.name: moved.value_with for moved in told.parameters}
+    assert found.share > 0.95 and term.alone == pytest.approx(found.share)
+    assert found.p < 1e-6 and found.noise < 0.05
+    now = {moved.name: moved.value for moved in found.parameters}
+    then = {moved.name: moved.value_with for moved in found.parameters}
     assert now["a"] < 0.45, "the physics took on the cubic's nearest line"
     assert then == pytest.approx(TRUE, abs=0.01)
 
@@ -100,9 +100,11 @@ def test_the_physics_with_the_term_leaves_the_learner_nothing(hardening):
     )
     again = fitted(-0.3, learner=None)
     again = oa.estimate(again.problem.record, grown, learner=oa.MLP(hidden=(6,)))
-    told = oa.explain(again)
-    assert not told.found and told.physics is None and told.spec is None and told.share == 0.0
-    assert "is not significant against its own errors" in told.text
+    result = oa.explain(again)
+    assert (
+        not result.found and result.physics is None and result.spec is None and result.share == 0.0
+    )
+    assert "is not significant against its own errors" in result.text
     assert dict(zip(grown.names, again.theta, strict=True)) == pytest.approx(
         TRUE | {"cubic": -0.3}, abs=0.01
     )
@@ -118,24 +120,24 @@ def test_a_suspect_that_is_given_is_tried(hardening):
 def test_a_function_from_another_toolbox_is_explained_as_it_is():
     given = fitted(-0.3, learner=None).problem
     plant = lambda x: (x @ [0.6, -0.2, 1.0] - 0.3 * x[:, 0] ** 3)[:, None]  # noqa: E731
-    told = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
-    (term,) = told.terms
+    found = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
+    (term,) = found.terms
     assert (
         term.expression == "y[k-1]**3"
         and term.coefficient == pytest.approx(-0.3)
         and term.std is None
     )
-    assert told.share == pytest.approx(1) and told.p is None and told.noise is None
-    assert [moved.value_with for moved in told.parameters] == pytest.approx(list(TRUE.values()))
+    assert found.share == pytest.approx(1) and found.p is None and found.noise is None
+    assert [moved.value_with for moved in found.parameters] == pytest.approx(list(TRUE.values()))
 
 
 def test_an_expression_with_commas_is_told_as_it_is_written():
     given = fitted(-0.3, learner=None).problem
     plant = lambda x: (x @ [0.6, -0.2, 1.0] + x[:, 2] - np.clip(x[:, 2], -0.4, 0.4))[:, None]  # noqa: E731
-    told = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
-    (term,) = told.terms
+    found = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
+    (term,) = found.terms
     assert term.kind in ("dead_zone", "saturation")  # beside the linear term they are the same
-    assert ", " in term.expression and told.text.startswith(f"{term.expression} explains")
+    assert ", " in term.expression and found.text.startswith(f"{term.expression} explains")
 
 
 def test_terms_of_several_equations_are_named_with_them():
@@ -266,9 +268,9 @@ def test_the_loop_ends_at_the_friction_law():
 
 
 def test_nothing_is_found_where_nothing_is_missing():
-    told = oa.explain(fitted(0.0))
-    assert not told.found and told.terms == () and "its own errors" in told.text
-    assert all(moved.value == moved.value_with for moved in told.parameters)
+    result = oa.explain(fitted(0.0))
+    assert not result.found and result.terms == () and "its own errors" in result.text
+    assert all(moved.value == moved.value_with for moved in result.parameters)
 
 
 def test_what_python_is_given(hardening):
@@ -338,10 +340,10 @@ def project(tmp_path_factory):
 @pytest.mark.usefixtures("without_figures")
 def test_the_command_tells_what_to_write_and_that_can_be_read(project):
     done = run("explain", project / "plant", project / "run.csv", "--json")
-    told = json.loads(done.out)
-    assert done.code == 0 and told["found"] and told["terms"][0]["expression"] == "y[k-1]**3"
+    result = json.loads(done.out)
+    assert done.code == 0 and result["found"] and result["terms"][0]["expression"] == "y[k-1]**3"
     grown = project / "grown.toml"
-    grown.write_text(SPEC + told["spec"] + "\n" + ALONE, encoding="utf-8")
+    grown.write_text(SPEC + result["spec"] + "\n" + ALONE, encoding="utf-8")
     assert [term.parameter for term in oa.load_spec(grown).spec.baseline.terms] == [
         "a",
         "b",

@@ -448,17 +448,17 @@ def test_one_and_two_threads_give_the_same(monkeypatch):
 @pytest.mark.parametrize("ny", [1, 2])
 def test_progress_ends_at_the_loss_of_the_segments(ny):
     """In deviations of the outputs, like the loss: over whole experiments both are the same sum."""
-    told = []
+    entries = []
     given, baseline = (record(), PHYSICS) if ny == 1 else (two_outputs(1, (0.05, 0.2)), SEPARATE)
     found = estimate(
         given,
         baseline,
         learner=None,
         criterion=Simulation(0, 8),
-        progress=lambda *a: told.append(a),
+        progress=lambda *a: entries.append(a),
     )
-    assert [(i, n) for i, n, _ in told] == [(0, n + 1) for n in range(found.status.iterations)]
-    assert told[-1][2] == pytest.approx(found.status.loss, rel=0.1)
+    assert [(i, n) for i, n, _ in entries] == [(0, n + 1) for n in range(found.status.iterations)]
+    assert entries[-1][2] == pytest.approx(found.status.loss, rel=0.1)
 
 
 # --- the error some steps ahead

@@ -184,8 +184,8 @@ WORKBOOKS = [
 def test_broken_workbooks(tmp_path, parts, message):
     pytest.importorskip("openpyxl")
     assert read_table(workbook(tmp_path / "whole.xlsx"), ("u", "y")).columns["y"].tolist() == [2, 4]
-    told = refusal(workbook(tmp_path / "run.xlsx", **parts))
-    assert any(part in told for part in message.split("|")), told
+    found = refusal(workbook(tmp_path / "run.xlsx", **parts))
+    assert any(part in found for part in message.split("|")), found
 
 
 def test_a_cell_at_the_far_corner_costs_nothing(tmp_path):
@@ -381,14 +381,14 @@ def put_zeros(path: Path, names: tuple[str, ...], head: bytes, size: int) -> Non
     body = first + size // 2**20 * packed + b"\x03\x00"  # an empty last block
     whole, central = io.BytesIO(), b""
     for name in names:
-        told = struct.pack(
+        found = struct.pack(
             "<HHHHHIIIHH", 20, 0, 8, 0, 33, 0, len(body), len(head) + size, len(name) + 4, 0
         )
         member = f"{name}.npy".encode()
         central += (
-            b"PK\x01\x02\x14\x00" + told + bytes(10) + struct.pack("<I", whole.tell()) + member
+            b"PK\x01\x02\x14\x00" + found + bytes(10) + struct.pack("<I", whole.tell()) + member
         )
-        whole.write(b"PK\x03\x04" + told + member + body)
+        whole.write(b"PK\x03\x04" + found + member + body)
     end = struct.pack("<HHHHIIH", 0, 0, len(names), len(names), len(central), whole.tell(), 0)
     path.write_bytes(whole.getvalue() + central + b"PK\x05\x06" + end)
 

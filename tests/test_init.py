@@ -380,8 +380,10 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     warning = "line 1 of a.csv is no UTF-8, so the file is read as Windows-1252; save it as UTF-8."
     assert warning in unfolded(run("check", tmp_path / "spec.toml").out)
     done = run("fit", tmp_path / "spec.toml", "--out", tmp_path / "out", "--json")
-    told = [w["text"] for w in json.loads(done.out)["warnings"] if w["code"] == "encoding_guessed"]
-    assert told[0] == f"train: {warning}"
+    warnings = [
+        w["text"] for w in json.loads(done.out)["warnings"] if w["code"] == "encoding_guessed"
+    ]
+    assert warnings[0] == f"train: {warning}"
 
 
 def test_a_damaged_byte_in_a_column_that_is_not_used_is_told_with_its_line(tmp_path):
@@ -430,9 +432,9 @@ def test_the_error_of_the_first_physics_is_of_runs_within_experiments(tmp_path):
     done = run(
         "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
     )
-    told = unfolded(done.out)
-    assert "Batch numbers 10 experiments" in told
-    error = re.search(r"error in free run is ([\d.]+) %", told)
+    output = unfolded(done.out)
+    assert "Batch numbers 10 experiments" in output
+    error = re.search(r"error in free run is ([\d.]+) %", output)
     assert error is not None and float(error[1]) < 5
 
 
@@ -443,9 +445,9 @@ def test_a_time_that_begins_anew_gives_the_step_and_is_not_listed_as_left_out(tm
     done = run(
         "init", tmp_path / "run.csv", "--inputs", "valve", "--outputs", "temp", "--out", spec
     )
-    told = unfolded(done.out)
-    assert f"30 s is usual in column '{header}', which begins anew with each experiment" in told
-    assert "left out" not in told
+    output = unfolded(done.out)
+    assert f"30 s is usual in column '{header}', which begins anew with each experiment" in output
+    assert "left out" not in output
     assert load_spec(spec).train.record.sampling_time == 30
 
 
@@ -477,9 +479,9 @@ def test_units_in_the_row_under_the_header(tmp_path):
     done = run(
         "init", tmp_path / "run.csv", "--out", spec, "--inputs", "valve", "--outputs", "flow"
     )
-    told = unfolded(done.out)
-    assert f"{len(u)} rows, 3 columns; units are in the row under the header" in told
-    assert "sampling time: 0.01 s, from column 'Zeit'" in told
+    output = unfolded(done.out)
+    assert f"{len(u)} rows, 3 columns; units are in the row under the header" in output
+    assert "sampling time: 0.01 s, from column 'Zeit'" in output
     data = tomllib.loads(spec.read_text(encoding="utf-8"))["data"]
     assert data["channels"] == {"valve": {"unit": "%"}, "flow": {"unit": "l/s"}}
     assert data["time"] == "Zeit"
@@ -522,8 +524,8 @@ def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
     t[200:] += 20.0
     pd.DataFrame({"t [ms]": t, "u": u, "y": y}).to_csv(tmp_path / "a.csv", index=False)
     done = run("init", tmp_path / "a.csv", "--out", tmp_path / "spec.toml", "--force")
-    told = " ".join(done.out.split())
-    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in told, done.err
+    output = " ".join(done.out.split())
+    assert "but the steps are uneven; single steps are 0.017 to 0.045 s" in output, done.err
     job = load_spec(tmp_path / "spec.toml")
     assert job.train.record.prepared[0].step == "resample"
     assert job.train.record.sampling_time == pytest.approx(0.02, rel=0.3)
@@ -789,8 +791,8 @@ def test_why_a_column_is_not_the_time_is_said(request, tmp_path, header, values,
     known = "0.02 s, because" if "six rows" in request.node.name else "no column states it"
     known = "0.02 s is usual" if "begins" in request.node.name else known
     assert done.code == 0 and f"sampling time: {known}" in done.out, done.err
-    told = done.out.replace("\n  ", " ").splitlines()  # folded lines go on indented
-    assert any(header in line and reason in line for line in told), done.out
+    output = done.out.replace("\n  ", " ").splitlines()  # folded lines go on indented
+    assert any(header in line and reason in line for line in output), done.out
     signals = [column.header for column in survey(tmp_path / "a.csv").signals]
     assert signals == (["u", "y"] if "signal" not in reason else [header, "u", "y"])
 
@@ -820,8 +822,10 @@ def test_what_follows_from_the_past_of_others_is_an_output(tmp_path, monkeypatch
     file = write_columns(tmp_path / "a.csv", level=z, valve=u, wind=w, other=rng.normal(size=600))
     done = run("init", file, "--out", tmp_path / "a.toml")
     assert done.code == 0
-    told = " ".join(done.out.split())
-    assert "past values of 'valve' and 'wind' help to predict 'level', but not the reverse" in told
+    output = " ".join(done.out.split())
+    assert (
+        "past values of 'valve' and 'wind' help to predict 'level', but not the reverse" in output
+    )
     assert "left out: other" in done.out
     spec = (tmp_path / "a.toml").read_text()
     assert 'inputs = ["valve", "wind"]' in spec and 'outputs = ["level"]' in spec

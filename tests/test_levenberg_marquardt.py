@@ -274,7 +274,7 @@ def test_same_start_same_run():
 
 @pytest.mark.parametrize("seconds", [0.0, 1e9], ids=["every step", "longer and longer"])
 def test_pauses_change_nothing(monkeypatch, seconds):
-    given, told = regression(MLP(hidden=(5,))), []
+    given, found = regression(MLP(hidden=(5,))), []
     solver = LevenbergMarquardt(iterations=40)
     w = given.bound.init(jax.random.key(3))
     options = compiled.Options(
@@ -289,7 +289,7 @@ def test_pauses_change_nothing(monkeypatch, seconds):
 
     monkeypatch.setattr(minimizer, "_SECONDS_PER_BURST", seconds)
     run = minimize(
-        given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: told.append((i, loss))
+        given, w, solver, ridge=0.1, evidence=True, progress=lambda i, loss: found.append((i, loss))
     )
     np.testing.assert_array_equal(run.w, whole.w)
     assert (run.ridge, run.iterations, run.ending) == (
@@ -297,8 +297,8 @@ def test_pauses_change_nothing(monkeypatch, seconds):
         int(whole.iteration),
         Ending(int(whole.control.code)),
     )
-    assert told[-1] == (run.iterations, float(run.normal.loss))
-    assert len(told) == (run.iterations if seconds == 0 else 5)  # one where the last window begins
+    assert found[-1] == (run.iterations, float(run.normal.loss))
+    assert len(found) == (run.iterations if seconds == 0 else 5)  # one where the last window begins
 
 
 def test_the_training_clock_stands_still_while_programs_are_made():

@@ -279,12 +279,12 @@ def test_holds_and_discrete_motions_give_the_same_response(pendulum):
         x[0], rel=1e-4
     )  # Runge-Kutta against the exponential
     spline = replace(model, form=replace(form, motion=replace(form.motion, hold="spline")))
-    told = oa.linearize(spline, "angle = 0", frequencies=[1.0])
-    assert [warning.code for warning in told.warnings] == ["hold_replaced"]
-    np.testing.assert_array_equal(told[0].a, view.a)
+    found = oa.linearize(spline, "angle = 0", frequencies=[1.0])
+    assert [warning.code for warning in found.warnings] == ["hold_replaced"]
+    np.testing.assert_array_equal(found[0].a, view.a)
     exact = view.to_control("continuous")(1j * w)
     assert (
-        told[0].bode.value[0, 0, 0] == pytest.approx(exact, rel=1e-10)
+        found[0].bode.value[0, 0, 0] == pytest.approx(exact, rel=1e-10)
         and view.bode.value[0, 0, 0] != exact
     )
 
@@ -327,8 +327,8 @@ def test_a_hold_is_undone_with_its_dead_time():
     s = 2j * np.pi * np.array([0.1, 1.0, 5.0])
     np.testing.assert_allclose(found.system.response(s).value[:, 0, 0], plant(s), rtol=1e-8)
     matrix[0, :2] = matrix[n, :2] = -0.3, 0.1
-    told = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
-    assert isinstance(told, str) and "a real pole below 0 (-0.5)" in told
+    result = convert_to_continuous(System(matrix, n, STEP), "zoh", memory, memory.names)
+    assert isinstance(result, str) and "a real pole below 0 (-0.5)" in result
 
 
 def test_poles_of_a_shift_register_are_zero_exactly_and_double_poles_have_no_derivative():
@@ -501,9 +501,9 @@ def test_the_command_writes_numbers_a_page_and_figures(cubic, tmp_path, monkeypa
         and "against data alone (Welch's spectra" in done.out
         and "written to linear" in done.out
     )
-    told = json.loads((tmp_path / "linear/result.json").read_text())
-    assert told["points"][0]["outputs"]["y"] == pytest.approx(0.5)
-    assert told["held"] == "found" and len(told["points"][0]["frequency"]) == 400
+    result = json.loads((tmp_path / "linear/result.json").read_text())
+    assert result["points"][0]["outputs"]["y"] == pytest.approx(0.5)
+    assert result["held"] == "found" and len(result["points"][0]["frequency"]) == 400
     assert (tmp_path / "linear/linear.txt").read_text().strip() in done.out
     for name in ("bode", "poles"):
         assert (tmp_path / f"linear/figures/{name}.png").stat().st_size > 5000

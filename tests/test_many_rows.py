@@ -64,12 +64,12 @@ def test_it_begins_at_the_weights_where_the_run_over_some_rows_ended(many, regul
 
 
 def test_progress_counts_passes_over_all_rows_and_asks_for_an_end_in_both(many):
-    told, few = [], []
+    entries, few = [], []
     fitted(
-        progress=lambda run, iteration, loss: told.append(iteration),
+        progress=lambda run, iteration, loss: entries.append(iteration),
         solver=oa.LevenbergMarquardt(40),
     )
-    assert told[0] == 0 and told == sorted(told)
+    assert entries[0] == 0 and entries == sorted(entries)
 
     def enough(run, iteration, loss):
         few.append(iteration)

@@ -340,13 +340,13 @@ def test_an_input_is_designed_for_the_motion(folder):
     )
     code, out, err = orthaug("design", spec, "--out", folder / "u.csv", "--json")
     assert code == 0, err
-    told, table = strict(out), pd.read_csv(folder / "u.csv")
+    found, table = strict(out), pd.read_csv(folder / "u.csv")
     assert list(table) == ["time", "force"] and len(table) == 300 and table.force.abs().max() <= 20
-    assert set(told["std"]) == {"m", "c", "k"} and told["relative_error"] ** 2 == pytest.approx(
-        told["cost"]
+    assert set(found["std"]) == {"m", "c", "k"} and found["relative_error"] ** 2 == pytest.approx(
+        found["cost"]
     )
-    errors = {row["name"]: row["std"] for row in told["candidates"]}
-    assert told["relative_error"] < 0.5 * errors["white binary, hold 1"]
+    errors = {row["name"]: row["std"] for row in found["candidates"]}
+    assert found["relative_error"] < 0.5 * errors["white binary, hold 1"]
     spec.write_text(spec.read_text().replace("samples = 300", "samples = 9"))
     code, _, err = orthaug("design", spec, "--out", folder / "v.csv")
     assert code == 2 and "design: `samples` must be" in err and not (folder / "v.csv").exists()
@@ -597,18 +597,18 @@ def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path)
     assert (
         "rank 3 of 4): m, c, k, g cannot be distinguished; give one of them as a constant." in err
     )
-    told = strict(out)
-    assert told["excitation"]["rank"] == told["identifiability"]["rank"] == 3
-    assert told["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
-    assert told["shared"]["determined"] == []  # they were, "with any learner of these inputs"
-    assert "The data determine" not in told["shared"]["text"]
-    assert told["motion"]["best_hold"] == "first-order"
-    residuals = {held["hold"]: held["residual"] for held in told["motion"]["holds"]}
+    found = strict(out)
+    assert found["excitation"]["rank"] == found["identifiability"]["rank"] == 3
+    assert found["identifiability"]["inseparable"] == [["m", "c", "k", "g"]]
+    assert found["shared"]["determined"] == []  # they were, "with any learner of these inputs"
+    assert "The data determine" not in found["shared"]["text"]
+    assert found["motion"]["best_hold"] == "first-order"
+    residuals = {held["hold"]: held["residual"] for held in found["motion"]["holds"]}
     assert residuals["first-order"] < 0.1 * residuals["zero-order"]
-    assert [warning["code"] for warning in told["warnings"]] == ["other_hold"]
-    others = {tuple(other["inputs"]): other["shared"] for other in told["shared"]["alternatives"]}
+    assert [warning["code"] for warning in found["warnings"]] == ["other_hold"]
+    others = {tuple(other["inputs"]): other["shared"] for other in found["shared"]["alternatives"]}
     assert others == {("x",): 1, ("x", "v"): 2, ("x", "v", "force"): 3}
-    assert told["shared"]["directions"] == [{"c": 1.0}]
+    assert found["shared"]["directions"] == [{"c": 1.0}]
 
 
 SUSPECTS = """
@@ -635,8 +635,8 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
     before = strict(out)["bias"]
     code, out, err = orthaug("fit", spec, "--out", folder / "suspects")
     assert code == 0, err
-    told = strict((folder / "suspects" / "result.json").read_text())
-    for table in (before, told["bias"]):
+    outcome = strict((folder / "suspects" / "result.json").read_text())
+    for table in (before, outcome["bias"]):
         friction, zone = table
         assert (friction["name"], friction["equation"], friction["unit"], friction["seen"]) == (
             "friction",
@@ -651,9 +651,9 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
         )
         assert friction["expected_bias"]["c"] == pytest.approx(0.73, rel=0.1)
         assert [friction["bias"][name] for name in "mk"] == pytest.approx([0, 0], abs=1e-9)
-    found = told["bias"][0]
+    found = outcome["bias"][0]
     assert found["coefficient_found"] == pytest.approx(1.5, rel=0.1) and found["explained"] > 0.9
-    rows = {row["name"]: row for row in told["parameters"]}
+    rows = {row["name"]: row for row in outcome["parameters"]}
     assert (
         rows["c"]["ci95_with_bias"][0] < C < rows["c"]["ci95_with_bias"][1] < rows["c"]["ci95"][0]
     )
@@ -661,7 +661,7 @@ def test_suspects_are_weighed_before_a_fit_and_after_it(folder, result):
     assert rows["m"]["ci95_with_bias"] == pytest.approx(rows["m"]["ci95"], rel=1e-9)
     assert "no suspect explains" not in out
     assert "of what the learner found is friction" in out and "biased" in [
-        w["code"] for w in told["warnings"]
+        w["code"] for w in outcome["warnings"]
     ]
     assert (folder / "suspects" / "figures" / "bias.png").exists()
 
@@ -743,14 +743,14 @@ def test_an_analysis_that_fails_numerically_loses_no_training(folder, result, mo
     spec.write_text(SPEC.replace("[training]", SUSPECTS))
     code, out, err = orthaug("fit", spec, "--out", folder / "fails")
     assert code == 0, err
-    told = strict((folder / "fails" / "result.json").read_text())
-    texts = [w["text"] for w in told["warnings"] if w["code"] == "analysis_failed"]
+    found = strict((folder / "fails" / "result.json").read_text())
+    texts = [w["text"] for w in found["warnings"] if w["code"] == "analysis_failed"]
     assert texts == [
         "the analysis of the modes failed numerically (Singular matrix): the result is given "
         "without it.",
         "the bias by suspects failed numerically (Singular matrix): the result is given without it.",
     ]
-    assert told["stability"] is None and told["bias"] is None and told["residuals"] is not None
+    assert found["stability"] is None and found["bias"] is None and found["residuals"] is not None
     assert all(unfolded(text) in unfolded(out + err) for text in texts)
     assert (folder / "fails" / "model").is_dir() and (folder / "fails" / "report.html").exists()
 

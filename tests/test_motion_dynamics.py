@@ -210,7 +210,7 @@ def test_sensitivities_of_steps_at_once_are_those_step_by_step(
     form, made = with_learner(spring(learned=True), 1)
     segments = build_segments(record(40), form, 19, 3)
     given = (form, made, segments, segments.start, np.array([[2.0]]))
-    told = []
+    entries = []
     for block, fewest in (
         (1 << 15, 1),
         (8 * 3 * (2 + form.unknowns) * segments.scored.shape[2], 8),
@@ -220,10 +220,10 @@ def test_sensitivities_of_steps_at_once_are_those_step_by_step(
             laid, "_BLOCK", block
         )  # one block; three, the last of which is not full; no blocks
         monkeypatch.setattr(laid, "_FEWEST", fewest)
-        told.append(sensitivity.__wrapped__(*given))
-    for other in told[1:]:
-        np.testing.assert_allclose(other.shared, told[0].shared, rtol=1e-11, atol=1e-12)
-        np.testing.assert_allclose(other.own, told[0].own, rtol=1e-11, atol=1e-12)
+        entries.append(sensitivity.__wrapped__(*given))
+    for other in entries[1:]:
+        np.testing.assert_allclose(other.shared, entries[0].shared, rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(other.own, entries[0].own, rtol=1e-11, atol=1e-12)
 
 
 def test_a_start_is_guessed_and_then_settled() -> None:

@@ -328,8 +328,8 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     assert fit.unidentified == ("b",) and np.isnan(fit.std[1])
     decay = 1 - 2 * TS  # of the record's own step; the motion runs between samples
     assert fit.values[0] == pytest.approx(-np.log(decay) / TS, abs=3 * fit.std[0])
-    (told,) = [warning.text for warning in fit.warnings if warning.code == "not_identified"]
-    assert told.startswith("not identified: b. ") and "the prior of the weights" in told
+    (found,) = [warning.text for warning in fit.warnings if warning.code == "not_identified"]
+    assert found.startswith("not identified: b. ") and "the prior of the weights" in found
 
 
 def test_the_band_of_what_is_learned_follows_all_that_was_estimated(
@@ -508,11 +508,11 @@ def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words:
     e = np.random.default_rng(2).normal(size=(4000, 2))
     e[1:, 0] += 0.2 * e[:-1, 0]
     tests = analyse([e], [np.zeros((4000, 0))], [np.zeros((4000, 0))], ["y", "z"], [], [])
-    told = describe_colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
+    found = describe_colour(tests, tuple(Predictable(name, 1.0, own, 0.0, 0.0) for name in "yz"))
     assert (
-        told.startswith("y has autocorrelations of up to 0.2")
-        and words in told
-        and "z has" not in told
+        found.startswith("y has autocorrelations of up to 0.2")
+        and words in found
+        and "z has" not in found
     )
 
 
@@ -539,9 +539,9 @@ def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
     assert small_effects(analyse([e], [u], [x], *names), shares) == ""
     e[:, 0] += 0.1 * u[:, 0]
     e[:, 1] += 0.1 * (x[:, 0] ** 2 - 1)
-    told = small_effects(analyse([e], [u], [x], *names), shares)
+    found = small_effects(analyse([e], [u], [x], *names), shares)
     assert (
-        told
+        found
         == " Tests still detect small effects (y follows u; z varies with v): 2 % of its mean square at most."
     )
 
@@ -622,17 +622,18 @@ SPEED = oa.MLP(hidden=(8,), inputs=("v",))
 def test_evidence_that_silences_dry_friction_is_tried_again():
     record = axis(friction=10.0)
     by_hand = oa.estimate(record, AXIS, learner=SPEED, regularization="evidence", blocks=0)
-    told = {warning.code: warning.text for warning in by_hand.warnings}
+    result = {warning.code: warning.text for warning in by_hand.warnings}
     assert (
-        by_hand.effective_weights < 1.5 and "contributes only a constant" in told["learner_silent"]
+        by_hand.effective_weights < 1.5
+        and "contributes only a constant" in result["learner_silent"]
     )
     assert abs(by_hand.values[1] - 203.5) > 20 * by_hand.std[1]
     found = oa.estimate(record, AXIS, learner=SPEED)
-    told = {warning.code: warning.text for warning in found.warnings}
-    assert found.effective_weights > 4 and "learner_silent" not in told
+    result = {warning.code: warning.text for warning in found.warnings}
+    assert found.effective_weights > 4 and "learner_silent" not in result
     assert (
         "Training was therefore repeated with no regularization and a ridge of"
-        in told["evidence_retried"]
+        in result["evidence_retried"]
     )
     assert [r.regularization for r in found.restarts][:2] == ["evidence", "none"]
     (low, high), _ = found.interval
@@ -686,12 +687,12 @@ def test_a_motion_whose_training_has_not_ended_has_no_intervals():
     )
     options = {"learner": oa.MLP(hidden=(6,), inputs=("x1",)), "blocks": 0, "fallback": False}
     short = oa.estimate(tanks(), motion, solver=oa.LevenbergMarquardt(60), **options)
-    told = {warning.code: warning.text for warning in short.warnings}
+    found = {warning.code: warning.text for warning in short.warnings}
     assert short.status.code == "iteration_limit" and short.std is None and short.interval is None
     assert short.parameters["std"].isna().all() and short.split(oa.Uniform()).std is None
     assert (
-        "while the loss was still falling" in told["not_converged"]
-        and "`iterations`" in told["not_converged"]
+        "while the loss was still falling" in found["not_converged"]
+        and "`iterations`" in found["not_converged"]
     )
     whole = oa.estimate(tanks(), motion, **options)
     assert (

@@ -96,11 +96,11 @@ def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_siz
         np.abs(alone.values - moved - TRUTH) < [9e-4, 1.2e-3, 0.025]
     ).all()  # three such standard errors
     assert friction.removed_by == "nothing" and friction.seen is None and friction.explained is None
-    told = friction.residual
-    assert told.coefficient == pytest.approx(
-        0.1, abs=3 * told.std
-    ) and told.coefficient == pytest.approx(0.1, rel=0.05)
-    assert told.t > 5 and told.share > 5 * hardening.residual.share
+    found = friction.residual
+    assert found.coefficient == pytest.approx(
+        0.1, abs=3 * found.std
+    ) and found.coefficient == pytest.approx(0.1, rel=0.05)
+    assert found.t > 5 and found.share > 5 * hardening.residual.share
     assert 0.9 < friction.cosine < 1.0
 
 
@@ -157,10 +157,10 @@ def test_explain_tells_the_parameters_with_the_term_in_the_physics(
     learned: oa.MotionEstimate,
 ) -> None:
     """c is fitted as a logarithm: a step of that as long as the bias would end at 0.83."""
-    told = oa.explain(learned, suspects=[FRICTION])
-    assert [term.expression for term in told.terms] == [FRICTION.expression]
-    assert [moved.value_with for moved in told.parameters] == pytest.approx(TRUTH, rel=0.005)
-    assert told.physics.initial[1] == pytest.approx(TRUTH[1], rel=0.005)
+    found = oa.explain(learned, suspects=[FRICTION])
+    assert [term.expression for term in found.terms] == [FRICTION.expression]
+    assert [moved.value_with for moved in found.parameters] == pytest.approx(TRUTH, rel=0.005)
+    assert found.physics.initial[1] == pytest.approx(TRUTH[1], rel=0.005)
 
 
 def test_what_the_learner_does_not_see_biases_as_data_with_it(learned: oa.MotionEstimate) -> None:
@@ -544,10 +544,10 @@ def test_the_size_of_a_cause_is_that_of_what_tells_of_it(
     alone: oa.MotionEstimate, learned: oa.MotionEstimate
 ) -> None:
     """Of a learner by what it found, also where the residual tells of the term; without a learner by the residual."""
-    told = oa.suspected_bias(alone, SUSPECTS)[0].residual
+    found = oa.suspected_bias(alone, SUSPECTS)[0].residual
     (entry,) = oa.suspected_bias(learned, [FRICTION])
-    budget = motion_budget(learned, [replace(entry, residual=told)])
-    assert budget.coefficient == entry.coefficient_found != told.coefficient
+    budget = motion_budget(learned, [replace(entry, residual=found)])
+    assert budget.coefficient == entry.coefficient_found != found.coefficient
     assert (
-        motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == told.coefficient
+        motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == found.coefficient
     )

@@ -380,5 +380,5 @@ def test_the_page_of_the_documents(tmp_path, monkeypatch):
         exec(block, names)
     assert Path("report.html").is_file() and names["upper"].lines
     pyplot.close("all")
-    told = re.findall(r"^\| `(\w+)\(", text, flags=re.MULTILINE)
-    assert set(told) == set(KINDS)
+    found = re.findall(r"^\| `(\w+)\(", text, flags=re.MULTILINE)
+    assert set(found) == set(KINDS)

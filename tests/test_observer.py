@@ -97,10 +97,10 @@ def test_the_steady_gain_is_that_of_riccatis_equation(make):
     for _ in range(400):
         now = now.update(zeros, np.zeros(ny))
     np.testing.assert_allclose(now.belief.covariance, p, rtol=0, atol=1e-8 * np.abs(p).max())
-    told = now.update(zeros, np.zeros(ny))
-    np.testing.assert_allclose(told.latest.spread, c @ p @ c.T + r, rtol=1e-8)
+    found = now.update(zeros, np.zeros(ny))
+    np.testing.assert_allclose(found.latest.spread, c @ p @ c.T + r, rtol=1e-8)
     for i, unit in enumerate(np.eye(ny)):
-        moved = np.asarray(now.update(zeros, unit).belief.state) - np.asarray(told.belief.state)
+        moved = np.asarray(now.update(zeros, unit).belief.state) - np.asarray(found.belief.state)
         np.testing.assert_allclose(moved, gain[:, i], rtol=0, atol=1e-8 * np.abs(gain).max())
 
 
@@ -160,9 +160,9 @@ def tracked(make):
 
 @pytest.mark.parametrize("make", [nonlinear_lagged, nonlinear_motion, linear_lagged])
 def test_innovations_are_white_and_as_large_as_expected(make):
-    told = tracked(make)[0].consistency()
-    assert told.consistent and 0.9 < told.expected[0] < told.nis < told.expected[1] < 1.1
-    assert all(test.p > 0.01 for test in told.whiteness)
+    found = tracked(make)[0].consistency()
+    assert found.consistent and 0.9 < found.expected[0] < found.nis < found.expected[1] < 1.1
+    assert all(test.p > 0.01 for test in found.whiteness)
 
 
 @pytest.mark.parametrize("make", [nonlinear_lagged, nonlinear_motion, linear_lagged])
@@ -194,10 +194,10 @@ def test_the_table_has_bands(make=nonlinear_motion):
 def test_wrong_noises_are_told():
     model, noise = nonlinear_lagged()
     measured, _, _, u = simulated(model, noise, 1000, seed=2)
-    told = oa.Observer(model, oa.Noise(0.3 * noise.state, 0.3 * noise.output)).run(
+    found = oa.Observer(model, oa.Noise(0.3 * noise.state, 0.3 * noise.output)).run(
         record_of(model, u, measured)
     )
-    assert not told.consistency().consistent and told.consistency().nis > 2
+    assert not found.consistency().consistent and found.consistency().nis > 2
 
 
 def test_the_likelihood_finds_the_noises():
@@ -322,8 +322,8 @@ def test_the_residual_tells_where_the_noise_enters(q, r, criterion):
     noise = oa.Observer(fit).noise
     assert noise.state[0, 0] == pytest.approx(q**2, rel=0.15, abs=5e-3 * r**2)
     assert noise.output[0, 0] == pytest.approx(r**2, rel=0.1)
-    told = oa.Observer(fit).run(system(q, r, seed=1)).consistency()
-    assert told.consistent and told.whiteness[0].p > 0.01
+    found = oa.Observer(fit).run(system(q, r, seed=1)).consistency()
+    assert found.consistent and found.whiteness[0].p > 0.01
 
 
 def test_a_model_by_itself_goes_by_how_it_was_trained():

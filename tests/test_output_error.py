@@ -346,10 +346,10 @@ def test_evidence_of_coloured_residuals_is_weaker():
 
 
 def test_progress_is_called_at_every_iteration():
-    told = []
-    found = run(rosenbrock(), [-1.2, 1.0], progress=lambda i, loss: told.append((i, loss)))
-    assert [i for i, _ in told] == list(range(1, found.iterations + 1))
-    losses = [loss for _, loss in told]
+    entries = []
+    found = run(rosenbrock(), [-1.2, 1.0], progress=lambda i, loss: entries.append((i, loss)))
+    assert [i for i, _ in entries] == list(range(1, found.iterations + 1))
+    losses = [loss for _, loss in entries]
     assert (
         all(b <= a for a, b in zip(losses, losses[1:], strict=False)) and losses[-1] == found.loss
     )

@@ -39,12 +39,12 @@ def bounds(requirements: list[str]) -> dict[str, str]:
 def test_the_version_stands_in_one_place():
     assert PROJECT["project"]["dynamic"] == ["version"] and "version" not in PROJECT["project"]
     assert PROJECT["tool"]["hatch"]["version"]["path"] == "src/orthaug/__init__.py"
-    told = {
+    found = {
         "citation": yaml.safe_load(text("CITATION.cff"))["version"],
         "recipe": recipe()["context"]["version"],
         "changelog": re.search(r"^## \[(.+?)\]", text("CHANGELOG.md"), re.MULTILINE)[1],
     }
-    assert told == dict.fromkeys(told, orthaug.__version__)
+    assert found == dict.fromkeys(found, orthaug.__version__)
 
 
 def test_the_recipe_asks_for_what_the_package_asks_for():
@@ -114,11 +114,11 @@ def test_the_container_copies_what_is_there():
 def test_the_wheel_carries_what_tells_of_every_key():
     wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["force-include"] == {"docs/spec.md": "orthaug/commands/spec.md"}
-    told = [
+    found = [
         line for line in text("docs/spec.md").rstrip().split("\n") if not line.startswith("<!--")
     ]
     keys = run("schema", "keys").out.rstrip()
-    assert keys.split("\n") == told  # which init's specs and the app point at
+    assert keys.split("\n") == found  # which init's specs and the app point at
     properties = json.loads(run("schema", "spec").out)["properties"]
     assert {"data", "baseline", "motion", "learner", "structure", "training"} <= set(properties)
     assert {name for name in properties if f"## [{name}]" not in keys.replace("[[", "[")} == set()
@@ -127,13 +127,13 @@ def test_the_wheel_carries_what_tells_of_every_key():
 @pytest.mark.parametrize("page", ["docs/start.md", "docs/install.md"])
 def test_every_extra_is_told(page):
     extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
-    told = set(
+    names = set(
         re.findall(
             r"`(\w+)`",
             text(page).partition("xtra")[2].partition("\n\n[")[0].partition("\nWhere an extra")[0],
         )
     )
-    assert extras <= told
+    assert extras <= names
 
 
 def test_the_image_sees_what_it_copies():

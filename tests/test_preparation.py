@@ -249,9 +249,15 @@ def test_the_free_run_is_advised_only_where_it_was_not_trained_on(tmp_path, focu
     for command in (["check", spec, "--json"], ["fit", spec, "--json", "--out", tmp_path / "out"]):
         done = run(*command)
         assert done.code == 0, done.err
-        (told,) = (w["text"] for w in json.loads(done.out)["warnings"] if "filtered" in w["code"])
-        assert ("training.focus" in told) == ("one step ahead" in told) == (focus == "prediction")
-        assert "Compare with a fit to the data as they are" in told
+        (warnings,) = (
+            w["text"] for w in json.loads(done.out)["warnings"] if "filtered" in w["code"]
+        )
+        assert (
+            ("training.focus" in warnings)
+            == ("one step ahead" in warnings)
+            == (focus == "prediction")
+        )
+        assert "Compare with a fit to the data as they are" in warnings
 
 
 def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
@@ -268,16 +274,16 @@ def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
     assert [one["step"] for one in result["data"]["prepare"]] == ["detrend", "lowpass"]
     assert result["data"]["prepare"][1]["options"]["cutoff"] == 0.4
     assert [w["code"] for w in result["warnings"]].count("filtered_noise") == 1
-    told = run("simulate", "result", "run.csv", "--out", "free.csv")
+    output = run("simulate", "result", "run.csv", "--out", "free.csv")
     assert (
-        told.code == 0
-        and "fitted to prepared data: detrend (degree 0), lowpass (cutoff 0.4" in told.err
+        output.code == 0
+        and "fitted to prepared data: detrend (degree 0), lowpass (cutoff 0.4" in output.err
     )
-    told = run("export", "result", "--to", "numpy", "--out", "code")
+    output = run("export", "result", "--to", "numpy", "--out", "code")
     assert (
-        told.code == 0
-        and "The code expects data after these steps" in told.err
-        and "detrend" in told.err
+        output.code == 0
+        and "The code expects data after these steps" in output.err
+        and "detrend" in output.err
     )
     for wrong, message in (
         ('step = "lowpas"\n', "'lowpass'"),

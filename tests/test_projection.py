@@ -311,6 +311,6 @@ def test_directions_that_differ_in_what_no_row_tells_are_one():
     phi = np.zeros((20, 1, 3))
     phi[:, 0, :2] = np.random.default_rng(1).normal(size=(20, 2))
     projection, basis = Projection.factor(phi), np.array([[1.0, 1.0], [0.5, 0.5], [0.0, 7.0]])
-    told = projection.without_null(basis)
-    assert told.shape == (3, 1) and np.linalg.matrix_rank(phi[:, 0] @ told) == 1
+    found = projection.without_null(basis)
+    assert found.shape == (3, 1) and np.linalg.matrix_rank(phi[:, 0] @ found) == 1
     assert np.array_equal(projection.without_null(basis[:, :1]), basis[:, :1])

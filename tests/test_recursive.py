@@ -87,9 +87,9 @@ def test_without_forgetting_it_is_the_batch_fit(name):
     if fit.std is None:
         assert online.std is None and "intervals   none" in online.summary()
     else:  # of coloured errors the robust ones
-        told = fit.robust() if len(online._watch.reference.colour) else fit
-        found, atol = oa.Recursive(told).covariance, 1e-12 * told.std.max() ** 2
-        np.testing.assert_allclose(found, told.covariance, rtol=1e-9, atol=atol)
+        result = fit.robust() if len(online._watch.reference.colour) else fit
+        found, atol = oa.Recursive(result).covariance, 1e-12 * result.std.max() ** 2
+        np.testing.assert_allclose(found, result.covariance, rtol=1e-9, atol=atol)
 
 
 def test_statistics_are_those_of_physics_alone_on_all_rows():

@@ -229,9 +229,9 @@ def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
     written = path.read_text()
     for changed in (written.replace("restarts = 3", "restarts = 4"), "not TOML"):
         path.write_text(changed)
-        told = tomllib.loads(origin_of(lagged.job, "fit").toml)
+        found = tomllib.loads(origin_of(lagged.job, "fit").toml)
         assert (
-            told["training"]["restarts"] == 3 and told["baseline"]["terms"][0]["parameter"] == "a"
+            found["training"]["restarts"] == 3 and found["baseline"]["terms"][0]["parameter"] == "a"
         )
     path.write_text(written)
     assert origin_of(lagged.job, "fit").toml == written
@@ -319,11 +319,11 @@ def test_units_that_the_spec_does_not_give_are_those_that_the_channels_ask_for(l
         row.model_copy(update={"unit": "", "derived_unit": "mm/N"})
         for row in lagged.result.parameters
     ]
-    told = Read(
+    found = Read(
         replace(lagged, result=lagged.result.model_copy(update={"parameters": rows})).report().html
     )
-    assert "(mm/N)" in told.text("td") and any(
-        "it follows from the units of the channels" in c for c in told.text("caption")
+    assert "(mm/N)" in found.text("td") and any(
+        "it follows from the units of the channels" in c for c in found.text("caption")
     )
 
 
@@ -398,7 +398,7 @@ def wave(rows: int, *, wild: int | None = None, experiments: int = 1) -> Respons
 
 def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
     (plot,) = run_plots([Run("tests.fast", wave(300, wild=200, experiments=2))], {})
-    (told,) = plot.layout["annotations"]
+    (found,) = plot.layout["annotations"]
     (left,) = [trace for trace in plot.traces if trace.get("mode") == "markers"]
     assert (
         f"At {left['x'][0]:.4g} s y of the model leaves the panel" in plot.caption
@@ -411,7 +411,7 @@ def test_a_divergence_is_seen_and_does_not_flatten_the_rest():
         and not low < run[1] < high
         and left["y"] == [high if run[1] > high else low]
     )
-    assert told["text"] == "free run diverges in y" and told["x"] == pytest.approx(
+    assert found["text"] == "free run diverges in y" and found["x"] == pytest.approx(
         0.01 * (301 + 200)
     )
     assert "diverges in y at row 200" in plot.caption and "2 experiments" in plot.caption
@@ -561,10 +561,10 @@ def test_the_verdict_is_built_from_the_findings(lagged, motion):
         and beyond.level == "care"
     )
     hurts = lagged.result.validation.model_copy(update={"verdict": "hurts"})
-    told = fit_verdict(lagged.result.model_copy(update={"validation": hurts, "advice": []}))
-    assert told.level == "bad" and "physics alone (`learner.kind" in told.then
+    found = fit_verdict(lagged.result.model_copy(update={"validation": hurts, "advice": []}))
+    assert found.level == "bad" and "physics alone (`learner.kind" in found.then
     assert all(
-        sentence.endswith(".") for verdict in (good, ran, told) for sentence in verdict.sentences
+        sentence.endswith(".") for verdict in (good, ran, found) for sentence in verdict.sentences
     )
 
 
@@ -594,15 +594,15 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
 
 
 def test_a_witness_is_told_where_runs_are_shown(lagged):
-    told = "train: findings and figures use 10 of 99 rows, in windows spread over them."
-    page = Read(replace(lagged, result=with_warning(lagged, "witness", told)).report().html)
+    found = "train: findings and figures use 10 of 99 rows, in windows spread over them."
+    page = Read(replace(lagged, result=with_warning(lagged, "witness", found)).report().html)
     (section,) = page.text("section", id="free-run")
-    assert told in section
+    assert found in section
 
 
 def test_minus_signs_of_texts_are_those_of_tables_and_short_cells_stay_whole(lagged):
-    told = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3, by 5 % or −1 %"
-    page = replace(lagged, result=with_warning(lagged, "small_margin", told)).report().html
+    outcome = "moves a by -0.015, see `a-1`: y[k-1] goes from -2 to 3, by 5 % or −1 %"
+    page = replace(lagged, result=with_warning(lagged, "small_margin", outcome)).report().html
     words = "moves a by −J0.015, see <code>a-1</code>: y[k-1] goes from −J2 to 3, by 5N% or −J1N%"
     assert words.replace("J", "\u2060").replace("N", "\xa0") in page  # no line ends within these
     whole = [

@@ -130,8 +130,8 @@ def test_halves_choose_on_one_and_fit_the_other():
     np.testing.assert_array_equal(
         one.record.experiments[0].outputs, record.experiments[0].outputs[600:]
     )
-    told = [note.code for note in first.notes]
-    assert "conditional_on_selection" in told and "conditional_on_selection" not in [
+    warnings = [note.code for note in first.notes]
+    assert "conditional_on_selection" in warnings and "conditional_on_selection" not in [
         n.code for n in one.notes
     ]
 

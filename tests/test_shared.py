@@ -366,21 +366,21 @@ PHYSICS = PhysicsMap.of(
 
 def test_what_could_be_imitated_in_words():
     problem = pose(oscillator(), OSCILLATOR, None, VELOCITY.inputs)
-    told = imitation(problem, PHYSICS)
-    assert told.text == (
+    found = imitation(problem, PHYSICS)
+    assert found.text == (
         "The learner sees y[k-1]-y[k-2] and could imitate t1 - t2. Along this direction the "
         "data alone do not determine θ; the orthogonal split does. The data determine t3 with "
         "any learner of these inputs. Of the physical parameters they determine ks."
     )
-    others = {other.inputs: (other.shared, other.physical) for other in told.alternatives}
+    others = {other.inputs: (other.shared, other.physical) for other in found.alternatives}
     assert others[("u[k-1]",)][0] == 1 and ("y[k-1]-y[k-2]",) not in others
 
 
 def test_a_learner_that_sees_everything_in_words():
-    told = imitation(pose(oscillator(), OSCILLATOR), PHYSICS)
-    assert told.everything and told.text.endswith("the orthogonal split does.")
-    assert told.physical == ()
-    assert {other.inputs: other.physical for other in told.alternatives}[("y[k-1]-y[k-2]",)] == (
+    found = imitation(pose(oscillator(), OSCILLATOR), PHYSICS)
+    assert found.everything and found.text.endswith("the orthogonal split does.")
+    assert found.physical == ()
+    assert {other.inputs: other.physical for other in found.alternatives}[("y[k-1]-y[k-2]",)] == (
         "ks",
     )
 
@@ -458,12 +458,16 @@ def test_check_asks_the_rows_what_the_learner_could_imitate(tmp_path, column, co
     assert done.code == 0, done.err
     result = json.loads(done.out)
     codes = ("shared_on_data", "nearly_shared", "little_left")
-    told = {one["code"]: one["text"] for one in result["warnings"] if one["code"] in codes}
-    assert list(told) == ([code] if code else [])
+    warnings = {one["code"]: one["text"] for one in result["warnings"] if one["code"] in codes}
+    assert list(warnings) == ([code] if code else [])
     assert ("e" in result["shared"]["determined"]) == (code != "shared_on_data")
     assert "m" in result["shared"]["determined"]
     if code:
-        assert " e" in told[code] and "%" in told[code] and "speed[k], place[k]" in told[code]
+        assert (
+            " e" in warnings[code]
+            and "%" in warnings[code]
+            and "speed[k], place[k]" in warnings[code]
+        )
 
 
 def test_a_computed_column_has_the_papers_projection_and_the_rest_stays_determined():

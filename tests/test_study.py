@@ -288,11 +288,13 @@ def test_a_study_says_how_many_run_at_a_time():
 
 
 def test_progress_counts_what_was_there(tmp_path):
-    told = []
+    entries = []
     study = Study("s", one, GRID)
-    run(study, store=tmp_path, workers=1, progress=lambda done, total: told.append((done, total)))
-    run(study, store=tmp_path, progress=lambda done, total: told.append((done, total)))
-    assert told == [*((i, 6) for i in range(7)), (6, 6)]
+    run(
+        study, store=tmp_path, workers=1, progress=lambda done, total: entries.append((done, total))
+    )
+    run(study, store=tmp_path, progress=lambda done, total: entries.append((done, total)))
+    assert entries == [*((i, 6) for i in range(7)), (6, 6)]
 
 
 def test_a_run_that_fails_keeps_the_others(tmp_path):

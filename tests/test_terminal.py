@@ -78,8 +78,8 @@ def test_help_names_arguments_as_one_types_them():
 
 def test_help_cuts_no_line_of_a_command(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    told = run("--help").out.partition("Commands:")[2]
-    assert "..." not in told and len(told.splitlines()) > 15
+    output = run("--help").out.partition("Commands:")[2]
+    assert "..." not in output and len(output.splitlines()) > 15
 
 
 def test_every_command_is_in_one_group_and_has_an_example_that_it_accepts():
@@ -237,11 +237,11 @@ def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log)
     )  # which fits other specs
     with caplog.at_level(logging.DEBUG, logger="orthaug"):
         assert run("fit", "plant.toml", "--out", "logged", "--force").code == 0
-    told = [record.getMessage() for record in caplog.records if record.name == "orthaug"]
-    assert told[0].startswith("training: 4 runs of LevenbergMarquardt, orthogonal")
+    found = [record.getMessage() for record in caplog.records if record.name == "orthaug"]
+    assert found[0].startswith("training: 4 runs of LevenbergMarquardt, orthogonal")
     assert sum(
-        "seed" in line and "iterations" in line for line in told
-    ) == 4 and "run 1 of 4 is chosen" in " ".join(told)
+        "seed" in line and "iterations" in line for line in found
+    ) == 4 and "run 1 of 4 is chosen" in " ".join(found)
 
 
 def test_the_log_is_silent_until_somebody_listens(capsys, no_log):

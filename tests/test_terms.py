@@ -143,8 +143,8 @@ def test_on_the_free_run_the_truth_is_inside_the_intervals():
 def test_terms_that_say_nothing_of_their_own_are_left_out_and_told():
     fit = oa.estimate(cubic(), PHYSICS, learner=oa.Terms(("u[k-1]", *TERMS, "2*u[k-1]**2")))
     assert set(fit.terms.index) == set(TERMS)
-    (told,) = [w.text for w in fit.warnings if w.code == "terms_left_out"]
-    assert told.startswith(
+    (found,) = [w.text for w in fit.warnings if w.code == "terms_left_out"]
+    assert found.startswith(
         "left out of the learner: u[k-1], 2*u[k-1]**2. On these data the physics, or the terms "
         "before"
     )

@@ -112,9 +112,9 @@ def test_auto_runs_none_and_ard_and_keeps_the_lowest_score(auto, candidates):
     kept = [
         i if scores[i] <= scores[i + 3] else i + 3 for i in range(3)
     ]  # of each start the better one
-    told = [fits[i].restarts[0] for i in kept]
+    found = [fits[i].restarts[0] for i in kept]
     assert [(r.seed, r.regularization, r.loss) for r in auto.restarts] == [
-        (r.seed, r.regularization, r.loss) for r in told
+        (r.seed, r.regularization, r.loss) for r in found
     ]
     assert [r.chosen for r in auto.restarts] == [i == best for i in kept]
     np.testing.assert_array_equal(auto.model.numbers.weights, fits[best].model.numbers.weights)
