@@ -714,6 +714,7 @@ TIMES = {
     "rounded instants": ("aika", np.round(0.025 * np.arange(300), 2), 0.025),
     "a cell that is missing": ("aika", np.where(np.arange(300) == 7, np.nan, EVEN), 0.02),
     "the last column": (None, EVEN, 0.02),
+    "a unit as its name": ("min", EVEN / 60, 0.02),
 }
 
 

@@ -132,7 +132,7 @@ class Clock:
             known = ", which rises as time does"
             known += (
                 ""
-                if split_header(self.column.titled)[1]
+                if split_header(self.column.titled)[1] or unit_of_time(self.column.titled)[1] != 1
                 else " and whose header has no unit; s is assumed"
             )
         if not self.even:

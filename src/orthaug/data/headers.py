@@ -24,7 +24,7 @@ _UNITS = re.compile(
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
 _TIME = re.compile(
     r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|"
-    r"elapsed([ _]?time)?|sec|seconds|"
+    r"elapsed([ _]?time)?|sec|seconds|msec|millis(econds)?|minutes|hours|days|"
     r"(time|zeit)[ _](in|within|since|im|in der|seit)([ _](the|of|dem|der))?[ _]"
     r"(batch|run|test|trial|cycle|experiment|session|start|begin|charge|lauf|versuch|beginn))$",
     re.IGNORECASE,
@@ -33,6 +33,20 @@ _STEP = re.compile(r"^(ts|dt|t_s|sampling_?time|sample_?time)$", re.IGNORECASE)
 _RATE = re.compile(r"^(fs|sampling_?rate|sample_?rate|sampling_?frequency)$", re.IGNORECASE)
 _PARTS = {"s": 1, "sec": 1, "ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9}  # of a second
 _MULTIPLES = {"min": 60.0, "h": 3600.0, "d": 86400.0}
+# a column of that name; a letter, as in `h` or `s`, would often be a height or a path
+_NAMED_BY_UNIT = {
+    "ms": 1e-3,
+    "msec": 1e-3,
+    "millis": 1e-3,
+    "milliseconds": 1e-3,
+    "min": 60.0,
+    "minute": 60.0,
+    "minutes": 60.0,
+    "hour": 3600.0,
+    "hours": 3600.0,
+    "day": 86400.0,
+    "days": 86400.0,
+}
 _OF_TIME = re.compile(rf"(.+)_({'|'.join([*_PARTS, *_MULTIPLES])})")
 _DATES = {
     ".": ("%d.%m.%Y", "%d.%m.%y"),
@@ -95,9 +109,12 @@ def last_part(name: str) -> str:
 def unit_of_time(header: str) -> tuple[str, float | None]:
     """Return the name of a column, and its unit in s.
 
-    The unit is 1 where the header has none, None where it is none of time.
+    The unit is 1 where the header has none and is none, as `minutes` is; None where it is none of
+    time.
     """
     base, unit = split_header(header)
+    if not unit and last_part(base).lower() in _NAMED_BY_UNIT:
+        return base, _NAMED_BY_UNIT[last_part(base).lower()]
     own = _OF_TIME.fullmatch(header)
     if not unit and own and _TIME.match(last_part(own[1])):
         base, unit = own[1], own[2]
