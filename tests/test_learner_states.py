@@ -191,10 +191,7 @@ def test_wrong_options_are_refused(options, words):
         oa.MLP((4,), **options)
 
 
-def test_lagged_physics_and_functions_are_refused_with_a_remedy(measured):
-    baseline = oa.Baseline.from_terms([oa.Term("a", "position[k-1]"), oa.Term("b", "force[k-1]")])
-    with pytest.raises(oa.InputError, match="beside equations of motion only"):
-        oa.estimate(measured[0], baseline, learner=oa.MLP((4,), states=1))
+def test_functions_are_refused_with_a_remedy(measured):
     motion = oa.Motion.from_functions(
         lambda x, u, p: (u - p[0] * x) / 1.0,
         lambda x, u, p: x,
@@ -261,16 +258,3 @@ def test_check_says_what_a_state_could_imitate(project):
     spec = (project / "spec.toml").read_text().replace('inputs = ["v"]', 'inputs = ["force"]')
     (project / "spec.toml").write_text(spec)
     assert "own state" not in run("check", "spec.toml").out
-
-
-def test_a_spec_of_lagged_physics_is_refused(project):
-    head = SPEC.partition("[motion.states]")[0]
-    (project / "spec.toml").write_text(
-        head
-        + '[[baseline.terms]]\nparameter = "a"\nregressor = "position[k-1]"\n'
-        + "[learner]\nstates = 2\n"
-    )
-    done = run("check", "spec.toml")
-    assert done.code == 2 and "'learner.states' = 2; a learner of lagged physics" in " ".join(
-        done.err.split()
-    )

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from orthaug._base.errors import InputError, KeyedError, Warning
+from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import plural
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.physics_findings import bias_before, imitable_before
 from orthaug.analysis.suspects import Suspect
 from orthaug.commands.job import Job, JobPhysics, Variant
 from orthaug.commands.parts import FilePart
-from orthaug.commands.spec import Spec, spec_error
+from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_suspects
 from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.record import Record
@@ -25,7 +25,6 @@ from orthaug.data.regressors import Lags, largest_lag
 from orthaug.data.sources import RecordSource
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
-from orthaug.fitting.rules import check_no_memory
 from orthaug.inference.measures import Measure, WeighedPhysics, weigh_problem
 from orthaug.physics import ill_conditioned
 from orthaug.physics.baseline import Baseline, regressor_of
@@ -67,10 +66,6 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
     @classmethod
     def declare(cls, spec: Spec, step: float | None) -> Self:
         baseline, learner_inputs = spec.declared_baseline(), spec.learner_inputs()
-        try:
-            check_no_memory(spec.declared_learner())
-        except KeyedError as error:
-            raise spec_error(error) from None
         physics = None if step is None else spec.physics_map(step)
         if physics is not None:
             baseline = with_initial(physics, baseline)

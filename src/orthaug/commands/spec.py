@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
@@ -35,11 +35,17 @@ from orthaug.commands.data_sections import (
     SourceSection,
     with_source_in_motion,
 )
+from orthaug.commands.lagged_sections import (
+    BaselineSection,
+    LagsSection,
+    Orders,
+    PhysicsSection,
+    with_lags_in_motion,
+)
 from orthaug.commands.sections import (
     Count,
     Finite,
     KindSection,
-    PhysicalSection,
     Positive,
     Section,
     first_message,
@@ -51,21 +57,19 @@ from orthaug.data.regressors import Lags
 from orthaug.data.tables import check_readable, is_table
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.kinds import CRITERIA, SOLVERS, STRUCTURES, Solver
-from orthaug.fitting.noise import ARMA, OF_MOTIONS, Innovations, Noise, Order
+from orthaug.fitting.noise import ARMA, Innovations, Noise, Order
 from orthaug.fitting.rules import check_solver, check_starts, choose_regularizations
 from orthaug.fitting.structures import Structure, with_measure
 from orthaug.inference.kinds import MEASURES, MeasurePlace
 from orthaug.inference.measures import Measure
 from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
-from orthaug.models.terms import over_lags
-from orthaug.physics.baseline import Baseline, Term
+from orthaug.physics.baseline import Baseline
 from orthaug.physics.integrators import INTEGRATORS
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.source_kinds import SOURCES
 
-Orders = Count | list[Count]
 Regularization = (
     Literal["none", "evidence", "ard"] | Annotated[float, Field(ge=0, allow_inf_nan=False)]
 )
@@ -77,115 +81,6 @@ _SECTIONS = {  # of keys that are not in [training]
     "states": "learner.states",
     "kind": "structure.kind",
 }
-
-
-class LagsSection(Section):
-    """The learner's regressor, by orders as in MATLAB."""
-
-    na: Orders = 0
-    nb: Orders = 0
-    nk: Orders = 1
-
-    @property
-    def declared(self) -> Lags:
-        """The declaration."""
-        orders = (self.na, self.nb, self.nk)
-        return Lags(*(tuple(v) if isinstance(v, list) else v for v in orders))
-
-
-class TermSection(Section):
-    """One column of φ."""
-
-    parameter: Annotated[str, Field(min_length=1)]
-    regressor: str | float
-    initial: Finite | None = None
-    unit: str | None = None
-    output: str | None = None
-    fixed: bool = False
-    min: Finite | None = None
-    max: Finite | None = None
-
-    @property
-    def declared(self) -> Term:
-        """The declaration."""
-        return Term(**{**self.model_dump(), "regressor": str(self.regressor)})
-
-
-class BaselineSection(Section):
-    """The physics."""
-
-    learns: ClassVar[bool] = True
-    reads_all_rows: ClassVar[str] = ""
-    by_evidence: ClassVar[bool] = False
-    takes_uneven_rows: ClassVar[bool] = False
-    foreign_keys: ClassVar[Mapping[str, str]] = dict.fromkeys(
-        ("equation", "factor", "unit"), "without [motion], which it belongs to"
-    )
-    terms: Annotated[list[TermSection], Field(min_length=1)]
-    constants: dict[str, Finite] = {}
-
-    @property
-    def declared(self) -> Baseline:
-        """The declaration."""
-        return Baseline.from_terms([term.declared for term in self.terms], self.constants)
-
-    def over(self, learner: Any, spec: Spec) -> Learner:
-        """Return a learner of terms over the lags of a spec."""
-        channels = tuple(spec.data.outputs), tuple(spec.data.inputs)
-        return over_lags(learner, spec.declared_baseline(), spec.lag_orders(), *channels)
-
-    def criterion(self, training: TrainingSection) -> Criterion:
-        """Return the criterion of a spec."""
-        return resolve(training.declared_criterion(training.chosen_focus()))
-
-    def check_beside(self, spec: Spec) -> None:
-        """Raise ValueError for what a spec cannot have beside these physics."""
-        if spec.controller is not None:
-            raise ValueError(
-                "`controller`: found beside [baseline]; expected a [motion]: write the terms as "
-                'one with `integrator` = "discrete", or leave it out and estimate one step '
-                'ahead with `noise.model` = "arma"'
-            )
-        if spec.data.missing == "keep":
-            raise ValueError(
-                '`data.missing`: found "keep"; lagged physics needs the outputs of every row. '
-                'Leave rows out by "skip", or state the physics as a [motion]'
-            )
-
-    def check_noise(self, spec: Spec, found: str) -> None:
-        """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
-        if spec.noise.model == "innovations":
-            raise ValueError(f"`noise.model` = innovations {OF_MOTIONS}")
-        if spec.declared_criterion().free_run is not None:
-            raise ValueError(
-                f"{found}, but training is not one step ahead; expected `training.focus` "
-                "prediction with a `horizon` of 1, or white noise"
-            )
-        if not spec.declared_solver().gauss_newton or spec.declared_structure().from_initial:
-            raise ValueError(
-                f"{found}; expected solver levenberg-marquardt and a solved θ with it, or white "
-                "noise"
-            )
-        if spec.training.ensemble:
-            raise ValueError(f"{found}; expected `training.ensemble` = false with it")
-        if spec.engine.kind not in ("auto", "memory"):
-            raise ValueError(
-                f"{found} beside `engine.kind` = {spec.engine.kind}; expected memory, because the "
-                "filter of a noise model needs all rows in their order"
-            )
-
-
-class PhysicsSection(Section):
-    """Physical parameters, and the expressions of θ in them."""
-
-    parameters: Annotated[dict[str, PhysicalSection], Field(min_length=1)]
-    theta: Annotated[dict[str, str], Field(min_length=1)]
-    profile: bool = False
-
-    def declared(self, constants: Mapping[str, float]) -> PhysicsMap:
-        """Return the physical parameters and their map to θ, with constants by their names."""
-        parameters = [section.declared(name) for name, section in self.parameters.items()]
-        return PhysicsMap.of(parameters, self.theta, constants)
 
 
 class SuspectSection(Section):
@@ -368,7 +263,7 @@ class Spec(Section):
     @model_validator(mode="before")
     @classmethod
     def _move_source(cls, content: dict[str, object]) -> dict[str, object]:
-        return with_source_in_motion(content)
+        return with_lags_in_motion(with_source_in_motion(content))
 
     @model_validator(mode="after")
     def _place(self, info: ValidationInfo) -> Spec:

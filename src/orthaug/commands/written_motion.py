@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from typing import Any
 
@@ -52,11 +53,14 @@ def motion_section(motion: Motion) -> Any:
         own.update({motion.equation_key: state.derivative})
         own.update({} if state.start is None else {"start": state.start})
         own.update({"learned": True} if state.learned else {})
+        own.update({"unit": state.unit} if state.unit else {})
         states.add(state.name, own)
     for parameter in motion.parameters:
         own = tomlkit.inline_table()
         own.update({"initial": parameter.initial})
         own.update({"unit": parameter.unit} if parameter.unit else {})
+        bounds = {"min": parameter.min, "max": parameter.max}
+        own.update({key: bound for key, bound in bounds.items() if math.isfinite(bound)})
         parameters.add(parameter.name, own)
     outputs = tomlkit.table()
     for output in motion.outputs:
@@ -71,4 +75,8 @@ def motion_section(motion: Motion) -> Any:
         section.add("define", define)
     section.add("outputs", outputs)
     section.add("parameters", parameters)
+    if motion.constants:
+        constants = tomlkit.table()
+        constants.update(dict(motion.constants))
+        section.add("constants", constants)
     return section

@@ -426,6 +426,25 @@ def _evaluate(
     return getattr(xp, _ELSEWHERE.get(node.func.id, node.func.id))(*arguments)
 
 
+def with_names(expression: Expression, names: Mapping[Lag, str]) -> str:
+    """Return the text of an expression with a name for every raw lag: `y[k-2]**2` as `y_1 ** 2`.
+
+    Raises:
+        InputError: a lag without a name.
+    """
+
+    class Named(ast.NodeTransformer):
+        def visit_Subscript(self, node: ast.Subscript) -> ast.Name:  # noqa: N802  (as `ast` asks)
+            return ast.Name(names[_lag(node, expression.text)], ast.Load())
+
+    for lag in expression.lags:
+        if lag not in names:
+            raise InputError(
+                f"'{expression.text}': {lag} is not among {', '.join(map(str, names))}."
+            )
+    return ast.unparse(Named().visit(ast.parse(expression.text, mode="eval")))
+
+
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
     if name == "k":
         return f"'{text}': k is the time index and not a value; write a channel at a lag, y[k-1]."

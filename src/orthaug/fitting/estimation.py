@@ -43,13 +43,14 @@ from orthaug.fitting.setup import TrainingSetup
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import plan_runs, train
-from orthaug.models.learners import MLP, Learner, declared, learns
+from orthaug.models.learners import MLP, Learner, declared, learns, remembers
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine
 from orthaug.models.tasks import runs_on
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.closed_loop import in_loop
 from orthaug.physics.controller import Controller
+from orthaug.physics.lagged_motion import motion_of_lags
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import MotionProblem, Problem
 from orthaug.physics.systems import System
@@ -128,7 +129,8 @@ def estimate(
         record: measured inputs and outputs; or `open_parquet(…)`, `open_frame(…)`, whose rows stay
             where they are.
         baseline: the physics; a `Motion` has no `lags` and no `ensemble`. A `System`, such as
-            `HammersteinWiener(order=2)`, writes a motion for the record.
+            `HammersteinWiener(order=2)`, writes a motion for the record. Beside a learner with
+            `states` a `Baseline` is fitted as the discrete motion of its lags.
         lags: the learner's regressor; None for the raw lags that the baseline's expressions use.
         learner: a declaration such as `MLP(hidden=(16,))`; None for physics alone.
         structure: `Orthogonal()`, `Additive()`, `OrthogonalPenalty(λ)` or `BaselinePenalty(λ)`.
@@ -195,6 +197,8 @@ def estimate(
     check_choice(standard_errors, ("auto", "plain", "unordered"), "standard_errors")
     if isinstance(baseline, System):
         baseline = baseline.motion(rows_in_memory(record))
+    if isinstance(baseline, Baseline) and remembers(learner):
+        baseline, lags, learner = _as_motion(baseline, lags, learner, record)
     check_type(initial, Estimate | Model | None, "initial", "an Estimate, a Model or None")
     physics = in_loop(baseline, controller, record)
     model = initial.model if isinstance(initial, Estimate) else initial
@@ -230,6 +234,15 @@ def estimate(
     if standard_errors == "plain":
         return made
     return MAKERS["intervals"](made, ordered=standard_errors == "auto")
+
+
+def _as_motion(
+    baseline: Baseline, lags: Lags | None, learner: Any, record: Record | Source
+) -> tuple[Motion, None, Learner]:
+    """Return lagged physics as a motion, and a learner with states that sees the same in it."""
+    outputs, inputs = ([channel.name for channel in of] for of in (record.outputs, record.inputs))
+    found = motion_of_lags(baseline, lags, learner.inputs, outputs, inputs)
+    return found.motion, None, replace(learner, inputs=found.learner_inputs)
 
 
 @overload

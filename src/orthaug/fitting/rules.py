@@ -97,14 +97,12 @@ def check_solver(solver: Solver, criterion: Criterion, regularizations: Sequence
 
 
 def check_no_memory(learner: Learner | None) -> None:
-    """Raise InputError for a learner with states of its own beside lagged physics."""
+    """Raise InputError for a learner with states of its own beside a problem of lagged physics."""
     if remembers(learner):
-        raise KeyedError(
-            "a learner has `states` beside equations of motion only; lagged physics remembers by "
-            "its lags. Give the learner more lags as `inputs`, or write the physics as a motion.",
-            "states",
-            f" = {getattr(learner, 'states', 0)}; a learner of lagged physics has no states. Give "
-            "it more lags in [lags], or write the physics as a [motion]",
+        raise InputError(
+            "a learner with `states` is trained beside equations of motion, and this problem is "
+            "posed with lagged physics. Call `estimate` with record and physics, which writes "
+            "that as a motion of its lags."
         )
 
 

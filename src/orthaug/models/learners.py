@@ -85,8 +85,8 @@ class MLP:
         beyond: what the correction does beyond the range of its training: "hold", "fade" within a
             quarter of the half-range, or "free"; "auto" holds it beside lagged physics and lets it
             fade in a motion.
-        states: states of its own, by which it remembers the past; 0 for none. Beside equations of
-            motion only (`physics.learner_states`).
+        states: states of its own, by which it remembers the past; 0 for none
+            (`physics.learner_states`). Lagged physics is fitted as the motion of its lags then.
         time_constants: of these states [s], with which training begins; None to spread them.
 
     Examples:
