@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from test_cli import run
@@ -146,3 +148,18 @@ def test_a_brake_that_lags_is_learned_to_the_noise():
     (run_,) = fit.simulate(plant(seed=1)).trajectories
     assert np.sqrt(np.mean(run_.errors**2)) < 1.5 * 0.003
     assert abs(fit.values[2] - 0.2) < 4 * fit.std[2]
+
+
+def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(tmp_path):
+    record = plant(900)
+    rows = zip(record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0], strict=True)
+    (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
+    path = tmp_path / "spec.toml"
+    path.write_text(SPEC.replace("states = 1\n", ""))
+    done = run("fit", path, "--out", tmp_path / "result")
+    assert done.code == 0
+    result = json.loads((tmp_path / "result" / "result.json").read_text())
+    best = result["advice"][0]
+    assert best["change"] == {"learner.states": 1}
+    assert best["after"] < 0.3 * best["before"]
+    assert "hidden_state" in {warning["code"] for warning in result["warnings"]}

@@ -21,6 +21,7 @@ from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
+from orthaug.commands.opening import job_of_change
 from orthaug.commands.proposals import (
     Proposal,
     mending_proposals,
@@ -140,11 +141,12 @@ class Trials:
         Raises:
             InputError: the change is not possible; ValueError likewise.
         """
-        return self.job.with_spec(
+        return job_of_change(
+            self.job,
             spec_model().model_validate(
                 apply_change(self.job.declaration, self.settled | change),
                 context={"folder": self.job.path.parent},
-            )
+            ),
         )
 
     def run(

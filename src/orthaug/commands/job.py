@@ -339,16 +339,6 @@ class Job:
         pose, train = self.physics.fold_training(self, variant)
         return partial(fit_fold, pose=pose, train=train, options=options)
 
-    def with_spec(self, spec: Spec) -> Job:
-        """Return the job of another spec on the same data, to be fitted to folds of them.
-
-        Raises:
-            InputError: what the spec declares cannot be fitted to the training data.
-        """
-        physics = self.physics.declare(spec, self.train.record.sampling_time)
-        problem = physics.pose(spec, self.train.record)
-        return replace(self, spec=spec, physics=physics, problem=problem, checkpoints=None)
-
     @property
     def runner(self) -> Threads | Engine:
         """Runner of the independent runs of this job."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,16 @@ PHYSICS: Mapping[type, Any] = {Baseline: LaggedPhysics, Motion: MotionPhysics}
 def job_physics(physics: Baseline | Motion) -> Any:
     """Return the part of a job that depends on its physics, without what a spec adds."""
     return PHYSICS[type(physics)](physics)
+
+
+def declare_physics(spec: Spec, step: float | None) -> Any:
+    """Return the part of a job that depends on its physics, as a spec declares these.
+
+    Raises:
+        InputError: what the spec declares cannot be, or does not go together.
+    """
+    kind = next(one for one in PHYSICS.values() if getattr(spec, one.section) is not None)
+    return kind.declare(spec, step)
 
 
 def open_job(path: Path, *, require_full_rank: bool = True) -> Job:
@@ -53,8 +64,7 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
         step = parts[0].record.sampling_time
     with _named(path):
         check_channels(spec.channels(spec.data.inputs), spec.channels(spec.data.outputs))
-        kind = next(one for one in PHYSICS.values() if getattr(spec, one.section) is not None)
-        physics = kind.declare(spec, step)
+        physics = declare_physics(spec, step)
     train, validation, tests = parts or load_parts(path, spec)
     with _named(path):
         first, least = physics.rows_needed(spec)
@@ -65,6 +75,17 @@ def open_spec(path: Path, spec: Spec, *, require_full_rank: bool = True) -> Job:
         return pose_job(
             path, spec, physics, (train, validation, tests), require_full_rank=require_full_rank
         )
+
+
+def job_of_change(job: Job, spec: Spec) -> Job:
+    """Return the job of another spec on the same data, to be fitted to folds of them.
+
+    Raises:
+        InputError: what the spec declares cannot be fitted to the training data.
+    """
+    physics = declare_physics(spec, job.train.record.sampling_time)
+    problem = physics.pose(spec, job.train.record)
+    return replace(job, spec=spec, physics=physics, problem=problem, checkpoints=None)
 
 
 def pose_job(

@@ -13,7 +13,7 @@ from orthaug.analysis.closed_loop import exchanged_with_output
 from orthaug.analysis.findings import LateInputResult
 from orthaug.analysis.input_timing import is_stepped
 from orthaug.analysis.wild_rows import wild_row_mendings
-from orthaug.commands.job import Job, declared_output
+from orthaug.commands.job import MISSING_STATE, Job, declared_output
 from orthaug.commands.parts import training_unit_faults
 from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
@@ -34,6 +34,8 @@ _MOST = 0.5  # of the learner: what explains more may take its place, as a trial
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
 _WIDER = 2  # times the neurons
 _ZONE = "dead_zone"
+_NETWORK = "mlp"
+_NEURONS = 8  # of a network that is proposed
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +176,10 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
         *_learner_for_equation(job, result, fit),
         *_holds(job, result),
     ]
+    # A learner takes longest
     return _unique_proposals(
-        sorted(found, key=lambda proposal: proposal.learns)
-    )  # a learner takes longest
+        sorted(found, key=lambda proposal: proposal.learns and proposal not in first)
+    )
 
 
 def _unique_proposals(found: list[Proposal]) -> list[Proposal]:
@@ -239,7 +242,25 @@ def _missing_states(job: Job, result: FitResult) -> Iterator[Proposal]:
         if made is not None:
             change, words = made
             yield Proposal(words, change)
+        else:
+            yield from _remembering_learner(job)
+        return
+
+
+def _remembering_learner(job: Job) -> Iterator[Proposal]:
+    """Yield a learner with a state of its own, for physics that cannot have the missing one."""
+    declared = job.declaration.get("learner", {})
+    if declared.get("states"):
+        return
+    change: dict[str, Any] = {"learner.states": 1}
+    if declared.get("kind", _NETWORK) != _NETWORK:
+        if job.physics.section == "motion":  # where to add a network is not known
             return
+        change = {"learner": {"kind": _NETWORK, "hidden": [_NEURONS], "states": 1}}
+    elif job.spec.declared_learner() is None:
+        return
+    words = f"{MISSING_STATE} in the learner (learner.states = 1)"
+    yield Proposal(words, change, learns=True, refocuses=True)
 
 
 def _state_explains_more(result: FitResult) -> bool:
@@ -369,11 +390,11 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
     if unread:
         now = spec.learner_inputs() or [str(lag) for lag in problem.layout]
         new = {"learner.inputs": [*now, *unread]}
-        change = {"learner": {"kind": "mlp"}} if spec.declared_learner() is None else {}
+        change = {"learner": {"kind": _NETWORK}} if spec.declared_learner() is None else {}
         words = f"a learner that also sees {join_words(unread)}"
         yield Proposal(words, change | new, learns=True)
     if spec.declared_learner() is None:
-        yield Proposal("a learner", {"learner": {"kind": "mlp"}}, learns=True)
+        yield Proposal("a learner", {"learner": {"kind": _NETWORK}}, learns=True)
         return
     if not bound.learns:  # it was tried, and physics alone was better
         return

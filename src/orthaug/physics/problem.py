@@ -178,8 +178,8 @@ class Problem(PosedProblem):
     """The filter L of a noise model: Φ and Y of projection and criterion are LΦ and LY."""
 
     new_state: ClassVar[str] = (
-        "add lags of outputs and inputs to the physics, or write the system as a motion, with that "
-        "state or with a learner that has states of its own (learner.states)"
+        "give the learner states of its own (learner.states), add lags of outputs and inputs to "
+        "the physics, or write the system as a motion with that state"
     )
 
     def __repr__(self) -> str:
