@@ -136,8 +136,9 @@ class PhysicsSection(Section):
 def with_lags_in_motion(content: Any) -> Any:
     """Return the content of a spec, with a motion for lagged physics beside a learner with states.
 
-    What reads lags, the learner's inputs and suspects, reads the motion's states then. Sections
-    that cannot be read stay, for their own checks to name the fault.
+    What reads lags, the learner's inputs and suspects, reads the motion's states then. An input
+    with a present sample, u[k], comes a row earlier by a step of preparation. Sections that cannot
+    be read stay, for their own checks to name the fault.
 
     Raises:
         InputError: physics that no motion can be.
@@ -174,4 +175,7 @@ def with_lags_in_motion(content: Any) -> Any:
     kept = {name: own for name, own in content.items() if name not in _LAGGED}
     kept["motion"] = motion_section(found.motion).unwrap()
     kept["learner"] = {**learner, "inputs": list(found.learner_inputs)}
+    steps = [{"step": "shift", "channel": name, "samples": -1} for name in found.advanced]
+    if steps:
+        kept["data"] = {**data, "prepare": [*data.get("prepare", []), *steps]}
     return kept | ({"suspects": moved} if moved else {})

@@ -9,6 +9,7 @@ from typing import Any, TypedDict, Unpack, overload
 import numpy as np
 
 from orthaug._base.checks import check_choice, check_type
+from orthaug._base.errors import InputError
 from orthaug._base.jax import release_programs
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug._base.views import MAKERS, with_progress
@@ -242,6 +243,12 @@ def _as_motion(
     """Return lagged physics as a motion, and a learner with states that sees the same in it."""
     outputs, inputs = ([channel.name for channel in of] for of in (record.outputs, record.inputs))
     found = motion_of_lags(baseline, lags, learner.inputs, outputs, inputs)
+    for name in found.advanced:
+        raise InputError(
+            f"beside a learner with `states` the next sample follows from earlier ones, and "
+            f"{name}[k] is a present one. Advance the input by "
+            f'prepare(record, Shift("{name}", -1)), and write {name}[k-1] for {name}[k] and so on.'
+        )
     return found.motion, None, replace(learner, inputs=found.learner_inputs)
 
 

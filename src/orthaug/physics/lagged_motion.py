@@ -8,7 +8,8 @@ place of the one before it after a sample:
     y⁺ = Σ θ_i φ_i,    y_1⁺ = y,    u_1⁺ = u,    u_2⁺ = u_1
 
 So lagged physics has what only motions have: a learner with states of its own. θ is then that of
-the free run.
+the free run. A state follows from the samples before it: of an input with a present sample, u_k,
+the motion's input is the one of the row after, so that u_k is its last sample.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class LaggedMotion:
     motion: Motion
     learner_inputs: tuple[str, ...]
     names: Mapping[Lag, str]
+    advanced: tuple[str, ...]
+    """The inputs that have to come a row earlier, by `prepare(record, Shift(name, -1))`."""
 
     def named(self, expression: str) -> str:
         """Return an expression of lags as one of states and inputs: `y[k-2]*u[k-1]` is `y_1 * u`.
@@ -61,8 +64,7 @@ def motion_of_lags(
         further: expressions of lags that the motion has to have a name for.
 
     Raises:
-        InputError: physics of a function, or of present samples, y_k = φ(u_k): a state follows
-            from the samples before it.
+        InputError: physics of a function.
     """
     if baseline.function is not None:
         raise InputError(
@@ -74,19 +76,14 @@ def motion_of_lags(
     constants = dict(baseline.constants)
     read = [lag for text in further for lag in parse(text, constants).lags]
     all_lags = in_order((*layout, *read), outputs, inputs)
-    for lag in all_lags:
-        if lag.lag == 0:
-            raise InputError(
-                f"a learner with `states` follows from earlier samples, and {lag} is a present "
-                f"one. Write {Lag(lag.channel, 1)} instead (`nk` = 1), or leave `states` out."
-            )
-    names = _names_of(all_lags, outputs, inputs, {*baseline.names, *constants})
+    advanced = tuple(dict.fromkeys(lag.channel for lag in all_lags if lag.lag == 0))
+    names = _names_of(all_lags, outputs, inputs, advanced, {*baseline.names, *constants})
     states = [
         *(State(name, _next_output(baseline, name, names), name, learned=True) for name in outputs),
         *(
             State(name, names[Lag(lag.channel, lag.lag - 1)], _start(lag, outputs))
             for lag, name in names.items()
-            if lag.lag > 1
+            if name != lag.channel
         ),
     ]
     own = (
@@ -106,24 +103,29 @@ def motion_of_lags(
         integrator="discrete",
     )
     shown = tuple(with_names(expression, names) for expression in features.entries)
-    return LaggedMotion(motion, shown, names)
+    return LaggedMotion(motion, shown, names, advanced)
 
 
 def _names_of(
-    lags: Layout, outputs: Sequence[str], inputs: Sequence[str], taken: set[str]
+    lags: Layout,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    advanced: Sequence[str],
+    taken: set[str],
 ) -> dict[Lag, str]:
     """Return the name of every lag down to the deepest of each channel: `y`, `y_1`, `y_2`."""
     names: dict[Lag, str] = {}
     taken = taken | {*outputs, *inputs}
     for channel in (*outputs, *inputs):
-        names[Lag(channel, 1)] = channel
-        deepest = max((lag.lag for lag in lags if lag.channel == channel), default=1)
-        for delay in range(2, deepest + 1):
-            name = f"{channel}_{delay - 1}"
+        last = 0 if channel in advanced else 1
+        names[Lag(channel, last)] = channel
+        deepest = max((lag.lag for lag in lags if lag.channel == channel), default=last)
+        for lag in range(last + 1, deepest + 1):
+            name = f"{channel}_{lag - last}"
             while name in taken:
                 name += "_"
             taken.add(name)
-            names[Lag(channel, delay)] = name
+            names[Lag(channel, lag)] = name
     return names
 
 
