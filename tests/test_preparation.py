@@ -368,6 +368,27 @@ def test_a_file_of_other_instants_needs_a_word(decimated, monkeypatch):
     assert len(pd.read_csv("plain.csv")) == len(pd.read_csv("inputs.csv"))
 
 
+def test_a_shift_is_a_part_of_the_model_and_done_without_a_word(tmp_path, monkeypatch):
+    """Rows in which the input acts two samples later than in training would run wrongly."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=200), np.zeros(200)
+    for k in range(3, 200):
+        y[k] = 0.8 * y[k - 1] + u[k - 3]
+    record = oa.Record.from_arrays(u=u, y=y, sampling_time=1.0)
+    pd.DataFrame({"u": u, "y": y}).to_csv("run.csv", index=False)
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+    moved = oa.prepare(record, oa.Shift("u", 2))
+    oa.save(oa.estimate(moved, physics, learner=None).model, "late")
+    done = run("simulate", "late", "run.csv", "--out", "a.csv")
+    assert "The same was done to these data; --no-prepare" in unfolded(done.err)
+    free = pd.read_csv("a.csv")
+    np.testing.assert_allclose(free["y_model"], free["y"], atol=1e-9)
+    raw = run("simulate", "late", "run.csv", "--no-prepare", "--out", "b.csv")
+    assert "taken as they are" in unfolded(raw.err)
+    assert len(pd.read_csv("b.csv")) == 200 and len(free) == 198
+
+
 def test_code_tells_what_its_signals_stand_for(decimated, monkeypatch):
     monkeypatch.chdir(decimated)
     assert run("export", "result", "--to", "c", "--out", "code").code == 0

@@ -248,7 +248,7 @@ Prepare = Annotated[
     typer.Option(
         "--prepare/--no-prepare",
         help="Prepare the rows as the training data were, by the model's steps.",
-        show_default="no",
+        show_default="no, but for a shift",
     ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files, whoever wrote them.")]

@@ -18,7 +18,7 @@ from orthaug._base.lines import percent, plural
 from orthaug.commands.folder import results_beside
 from orthaug.commands.parts import gaps_text, long_stretches
 from orthaug.data.channels import Channel
-from orthaug.data.preparation import MENDING, SAMPLING, steps_again
+from orthaug.data.preparation import MENDING, SAMPLING, Preparation, steps_again
 from orthaug.data.readers import read_record
 from orthaug.data.record import Record
 from orthaug.data.tables import check_readable, has_column
@@ -224,7 +224,7 @@ def open_run(
         raise InputError(f"{error} --missing skip leaves such rows out{keep}.") from None
     rows, notes = (
         len(record) + record.missing,
-        prepared_notes(loaded, record if reading.prepare else None),
+        prepared_notes(loaded, record if reading.prepare else None, _as_read(loaded, reading)),
     )
     if loaded.experiment_column and not experiment_column(loaded, data):
         notes += (
@@ -291,11 +291,29 @@ def record_for(
 def _steps_of(
     model: Model, reading: ReadOptions, outputs: Sequence[Channel]
 ) -> tuple[Sequence[Any], float]:
-    """Return the steps of preparation, and the time from a row of the file to the next in s."""
+    """Return the steps of preparation, and the time from a row of the file to the next in s.
+
+    When an input acts is a part of the model: without a choice its shift is done all the same.
+    """
     steps, step = (), model.sampling_time
-    if reading.prepare:
-        steps, step = steps_again(model.prepared, [c.name for c in (*model.inputs, *outputs)], step)
+    done = model.prepared if reading.prepare else _shifts(model) if reading.prepare is None else ()
+    if done:
+        steps, step = steps_again(done, [c.name for c in (*model.inputs, *outputs)], step)
     return steps, step / reading.every
+
+
+def _shifts(model: Model) -> tuple[Preparation, ...]:
+    """Return the shifts of inputs in the preparation of a model's training data."""
+    return tuple(done for done in model.prepared if done.step == "shift")
+
+
+def _as_read(model: Model, reading: ReadOptions) -> str:
+    """Return what was done to the rows of a file for which no preparation was asked."""
+    if reading.prepare is None and (shifts := _shifts(model)):
+        if len(shifts) == len(model.prepared):
+            return "The same was done to these data; --no-prepare takes the rows as they are."
+        return "The shift was done to these data; --prepare does all of it, --no-prepare nothing."
+    return _RAW
 
 
 def _later(record: Record, time: float) -> Record:
