@@ -122,8 +122,14 @@ class MotionTerms:
         return Linearization(Projection.factor(rows.transpose(1, 2, 0)), self.shared.basis, learner)
 
     def weigh(self, rows: np.ndarray) -> np.ndarray:
-        """Return rows (M, nl) times the root of their weights over their sizes."""
-        return rows * np.sqrt(self.field.weight)[:, None] / self.field.size
+        """Return rows (M, nl) times the root of their weights over their sizes.
+
+        What drives the learner's own states counts as nothing: the physics has no part in it.
+        """
+        motion = self.motion
+        memory = [i for i, state in enumerate(motion.states) if state.memory]
+        own = ~np.isin(learned_places(motion), memory)
+        return rows * own * np.sqrt(self.field.weight)[:, None] / self.field.size
 
     def usual(self) -> tuple[MotionSuspect, ...]:
         """Return the usual suspects, with widths from the range of the run."""

@@ -147,9 +147,13 @@ def equations_of(motion: Motion) -> tuple[str, ...]:
 
 
 def usual_places(motion: Motion) -> tuple[int, ...]:
-    """Return the state equations likely to lack a term: learned ones, else with parameters."""
-    if motion.learned[0]:
-        return motion.learned[0]
+    """Return the state equations likely to lack a term: learned ones, else with parameters.
+
+    The equations of a learner's own states are none of the physics.
+    """
+    learned = tuple(i for i in motion.learned[0] if not motion.states[i].memory)
+    if learned:
+        return learned
     if motion.functions is not None:
         return tuple(range(len(motion.states)))
     return tuple(i for i, state in enumerate(motion.states) if motion.parameters_in(state.name))
