@@ -203,3 +203,21 @@ def test_models_in_lags_refuse():
         oa.Record.from_arrays([1.0, 2.0], time=[0.0, 1.0], sampling_time=2.0)
     with pytest.raises(oa.InputError, match="rising"):
         oa.Record.from_arrays([1.0, 2.0], time=[0.0, 0.0])
+
+
+@pytest.mark.parametrize("adds_up", [True, False])
+def test_steps_that_vary_by_themselves_are_uneven_and_late_stamps_are_not(tmp_path, adds_up):
+    """Both deviate from the usual step by less than a lost sample would."""
+    rng, rows = np.random.default_rng(4), 400
+    t, jitter = np.arange(rows) * 0.05, 0.2 * 0.05 * rng.uniform(-1, 1, rows)
+    t = np.cumsum(0.05 + jitter) if adds_up else t + jitter
+    path = tmp_path / "run.csv"
+    u = np.repeat(rng.normal(size=rows // 8), 8)
+    signals = np.c_[t, u, lsim(([1], [1, 1]), u, np.arange(rows) * 0.05)[1]]
+    np.savetxt(path, signals, delimiter=",", header="t [s],u,y", comments="", fmt="%.6f")
+    whole = oa.read_record(path, inputs=["u"], outputs=["y"], time="t [s]", uneven=True)
+    assert whole.even != adds_up
+    spec = tmp_path / "spec.toml"
+    done = run("init", path, "--inputs", "u", "--outputs", "y", "--out", spec)
+    assert ("but the steps are uneven" in done.out) == adds_up, done.err
+    assert ('"resample" # difference equations need it' in spec.read_text()) == adds_up

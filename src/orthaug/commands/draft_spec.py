@@ -247,6 +247,8 @@ def _data(
     for kind, keys in steps_of(found, roles):
         step = tomlkit.table()
         step.update({"step": kind, **keys})
+        if kind == "resample":
+            step["step"].comment("difference equations need it, [motion] under rk4 does not")
         steps.append(step)
     if len(steps):
         data.add("prepare", steps)

@@ -149,6 +149,22 @@ class Clock:
         return text
 
 
+def steps_accumulate(instants: Vector) -> bool:
+    """Return whether rising instants leave every even grid by more than half a sample.
+
+    Stamps that are logged late scatter about a grid. Where each step varies by itself, deviations
+    add up: the samples themselves were taken at uneven instants.
+    """
+    if len(instants) < 3:
+        return False
+    steps, rows = np.diff(instants), np.arange(float(len(instants)))
+    mean = float(steps.mean())
+    if float(steps.std()) <= _JITTERS * mean:
+        return False
+    slope, level = np.polyfit(rows, instants - instants[0], 1)
+    return bool(np.abs(instants - instants[0] - level - slope * rows).max() > 0.5 * mean)
+
+
 def find_clock(columns: Sequence[Column], near: str = "") -> Clock:
     """Return the clock among some columns.
 
@@ -369,5 +385,6 @@ def _column_clock(column: Column, seconds: Vector) -> Clock:
     steps = np.diff(seconds[np.isfinite(seconds)])
     usual = float(np.median(steps))
     even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())
+    even = even and not steps_accumulate(seconds[np.isfinite(seconds)])
     step = float(steps.mean()) if even and not column.missing else usual
     return Clock(float(f"{step:.9g}"), column, seconds, even=even)

@@ -19,7 +19,7 @@ from orthaug._base.checks import Vector, check_choice, check_count, check_type
 from orthaug._base.errors import BadCellError, InputError, MissingSampleError, show
 from orthaug._base.lines import plural
 from orthaug.data.channels import Channel, as_channels
-from orthaug.data.clock import DRIFT, JITTER, thinned_fault
+from orthaug.data.clock import DRIFT, JITTER, steps_accumulate, thinned_fault
 from orthaug.data.layouts import MISSING, STATES, text_number
 from orthaug.data.preparation import MENDING, STEPS, check_steps, prepared_experiments
 from orthaug.data.record import Experiment, Record, check_step, same_step, steps_between, unbroken
@@ -145,6 +145,7 @@ def read_record(
                         raise
                     _check_rising(table, time, start, stop)
                     is_uneven = True
+                is_uneven |= uneven and steps_accumulate(table.columns[time][start:stop])
     if time and is_uneven:
         record = Record(
             tuple(channels[0]),
