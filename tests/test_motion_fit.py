@@ -763,3 +763,28 @@ def test_a_model_of_segments_that_were_not_padded_is_split_as_ever() -> None:
     np.testing.assert_allclose(again.theta, fit.theta, rtol=1e-12)
     with pytest.raises(oa.InputError, match="trained on other rows"):
         reopen_estimate(replace(fit.model, trained=alone._replace(rows=7)), data())
+
+
+def test_the_unit_of_an_output_moves_no_parameter():
+    """A position in m beside a pressure in Pa: errors that differ by eight orders of magnitude."""
+    rng, rows = np.random.default_rng(3), 200
+    u, x, p = np.repeat(rng.normal(size=40), 5), np.zeros(rows), np.zeros(rows)
+    for k in range(1, rows):
+        x[k], p[k] = 0.9 * x[k - 1] + 0.1 * p[k - 1], 0.7 * p[k - 1] + 0.3 * u[k - 1]
+    e = 0.02 * rng.normal(size=(rows, 2)) @ [[1.0, 0.8], [0.0, 0.3]]
+    found = []
+    for unit in (1.0, 1e8):
+        motion = oa.Motion.from_equations(
+            states=[
+                oa.State("a", f"0.1*(c*b/{unit} - a)", start="x"),
+                oa.State("b", f"d*({unit}*u - b)", start="p"),
+            ],
+            outputs=[oa.Output("x", "a"), oa.Output("p", "b")],
+            inputs=["u"],
+            parameters=[oa.PhysicalParameter("c", 0.8), oa.PhysicalParameter("d", 0.2)],
+        )
+        y = np.c_[x + e[:, 0], unit * (p + e[:, 1])]
+        record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["x", "p"])
+        fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation(0, 0))
+        found.append([fit.values, fit.std])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)

@@ -458,7 +458,7 @@ def reweight(
     covariance = problem.target_covariance
     for _ in range(_TURNS):
         noise = estimate.model.statistics.noise if estimate.status.ok else None
-        white = None if noise is None else whitening_matrix(noise)
+        white = None if noise is None else whitening_matrix(noise, problem.deviation)
         if white is None:
             return replace(estimate, restarts=first.restarts)
         weight = by_covariance(white, covariance)

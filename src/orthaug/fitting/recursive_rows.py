@@ -312,7 +312,7 @@ def begin(
     noise = residual.T @ residual * (ny / freedom)
     least = (_SMALLEST * model.deviation * np.diag(model.weight)) ** 2
     noise = noise + np.diag(least)
-    white = whitening_matrix(noise)
+    white = whitening_matrix(noise, model.deviation)
     white = np.diag(1 / np.sqrt(np.diag(noise))) if white is None else white
     level = float(np.trace(noise)) / ny
     recursion = start_recursion(

@@ -193,11 +193,12 @@ class SegmentedProblem:
         kept = self._checkpoint(objective, p, start, options)
         end = first.descend(objective, p, start, progress=progress, kept=kept, **options)
         noise = self.noise(objective, end) if two_legs and end.ending.usable else None
-        white = None if noise is None else whitening_matrix(noise)
+        white = None if noise is None else whitening_matrix(noise, self.deviation)
         if noise is not None and white is not None:
             # So that the ridge keeps its place
             size = np.trace(objective.weight @ noise @ objective.weight.T) / ny
             objective = replace(objective, weight=np.sqrt(size) * white)
+        if white is not None or (two_legs and end.ending is Ending.RUNNING):
             done = end.iterations
             begun, options = (
                 Start(end.point.states),

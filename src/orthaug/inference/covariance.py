@@ -60,13 +60,17 @@ def noise_covariance(squares: Matrix, freedom: Vector) -> Matrix | None:
     return squares / np.sqrt(np.outer(freedom, freedom))
 
 
-def whitening_matrix(noise: Matrix) -> Matrix | None:
+def whitening_matrix(noise: Matrix, deviation: Vector) -> Matrix | None:
     """Return W with `W Σ Wᵀ = I` (ny, ny).
 
-    None for a covariance that is singular, as of outputs without errors.
+    None for a covariance that is singular, as of outputs without errors: in the outputs' deviations
+    (ny,), for a position in m and a pressure in Pa differ by units alone.
     """
+    noise = noise / np.outer(deviation, deviation)
     values = np.linalg.eigvalsh(noise)
-    return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
+    if not values[0] > 1e-12 * values[-1]:
+        return None
+    return np.linalg.inv(np.linalg.cholesky(noise)) / deviation
 
 
 def mixing_matrix(noise: Matrix) -> Matrix:
