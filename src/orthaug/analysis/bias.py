@@ -24,6 +24,9 @@ from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.lines import percent
 from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.inference.linearization import Certificate, Linearization
+from orthaug.physics.projection import Projection
+
+_KNOWN = 1e-6  # of a term's size: what the physics leaves of one that it has, with roots and powers
 
 RemovedBy = Literal["learner", "learner and measure", "learner in part", "measure", "nothing"]
 
@@ -303,6 +306,23 @@ def bias_table(
         term_bias(physics, suspect, response, certify=certify)
         for suspect, response in zip(suspects, responses or (), strict=responses is not None)
     ]
+
+
+def has_term(jacobian: Projection, values: Matrix) -> bool:
+    """Return whether physics expresses a term by its own parameters.
+
+    A constant beside the physics' own, or a root of what it has the root of, is nothing that it
+    lacks.
+
+    Args:
+        jacobian: ∂f/∂θ over points.
+        values: the term there (M, ny).
+    """
+    size = np.abs(values).max(initial=0.0)
+    if not 0 < size < np.inf:
+        return False
+    unit = values / size
+    return bool(np.linalg.norm(jacobian.orthogonal_part(unit)) <= _KNOWN * np.linalg.norm(unit))
 
 
 def seen_table(physics: TermPhysics, suspects: Sequence[Any]) -> list[SuspectedBias]:

@@ -93,6 +93,7 @@ class PhysicalBias(Content):
 
 
 NO_GUESS = 0.01  # of the outputs' standard deviation: a term without a guess of its size
+_AT_ZERO = 1e5  # times a value: a bias by which it is next to zero, and per cent mean nothing
 
 
 class SuspectResult(Content):
@@ -129,14 +130,16 @@ class SuspectResult(Content):
 
         With a guess it is the bias by the guessed coefficient. Without one the RMS of the term
         counts as `NO_GUESS` of the outputs' standard deviation, with the sign that the learner
-        shows, so that the bias has the sign of a budget's.
+        shows, so that the bias has the sign of a budget's. None of a value that is next to zero.
         """
         coefficient = self.coefficient
         if coefficient is None and self.size:
             coefficient = math.copysign(NO_GUESS / self.size, self.coefficient_found or 1.0)
         relative = {**(self.relative_bias or {}), **(self.relative_physical_bias or {})}
         shares = {
-            k: None if v is None or coefficient is None else 100 * v * coefficient + 0.0  # no -0
+            k: None
+            if v is None or coefficient is None or abs(v * coefficient) > _AT_ZERO
+            else 100 * v * coefficient + 0.0  # no -0
             for k, v in relative.items()
         }
         exact = {

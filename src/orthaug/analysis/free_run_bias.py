@@ -22,6 +22,7 @@ from orthaug.analysis.bias import (
     SuspectedBias,
     TermResponse,
     bias_table,
+    has_term,
     seen_table,
 )
 from orthaug.analysis.bias_hull import MOST_PHYSICS
@@ -131,14 +132,28 @@ class MotionTerms:
         own = ~np.isin(learned_places(motion), memory)
         return rows * own * np.sqrt(self.field.weight)[:, None] / self.field.size
 
-    def usual(self) -> tuple[MotionSuspect, ...]:
-        """Return the usual suspects, with widths from the range of the run."""
-        place = self.place
+    def usual(self) -> list[MotionSuspect]:
+        """Return the usual suspects that the physics does not have, with widths from the run."""
+        place, motion = self.place, self.motion
         segmented = place.segmented if len(place.w) else place.segmented.physics_only
         x, u = segmented.trajectory(place.c, place.w, place.states)
         there = np.isfinite(x).all(axis=1)
-        initial = self.motion.initial
-        return Catalogue.of_motion(self.motion, initial, x[there], u[there], self._seen).usual()
+        x, u = x[there], u[there]
+        found = Catalogue.of_motion(motion, motion.initial, x, u, self._seen).usual()
+        spread = np.unique(np.linspace(0, len(x) - 1, MOST_POINTS).astype(int)) if len(x) else []
+        if not len(spread):
+            return list(found)
+        x, u = x[spread], u[spread]
+        slopes = np.asarray(slopes_at(segmented.dynamics.physics_only, self.q, x, u))
+        if not np.isfinite(slopes).all():
+            return list(found)
+        jacobian, equations = Projection.factor(slopes), range(slopes.shape[1])
+
+        def known(suspect: MotionSuspect) -> bool:
+            values = suspect.values(motion, self.value, x, u)[:, None]
+            return has_term(jacobian, values * np.isin(equations, suspect.place(motion)))
+
+        return [suspect for suspect in found if not known(suspect)]
 
     @cached_property
     def catalogue(self) -> Catalogue:

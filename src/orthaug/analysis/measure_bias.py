@@ -12,7 +12,13 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
 from orthaug.analysis.absorbed import term_effects
-from orthaug.analysis.bias import SuspectedBias, TermResponse, bias_table, seen_table
+from orthaug.analysis.bias import (
+    SuspectedBias,
+    TermResponse,
+    bias_table,
+    has_term,
+    seen_table,
+)
 from orthaug.analysis.bias_hull import MOST_PHYSICS
 from orthaug.analysis.catalogue import Catalogue, saturations
 from orthaug.analysis.causes import Considered
@@ -94,6 +100,11 @@ class LaggedTerms:
         """The terms that no one named."""
         return Catalogue.of_problem(self.problem)
 
+    def usual(self) -> list[Suspect]:
+        """Return the usual suspects that the physics does not have."""
+        jacobian = self.linearization.jacobian
+        return [s for s in self.catalogue.usual() if not has_term(jacobian, self.values(s))]
+
     @property
     def certifies(self) -> bool:
         return len(self.weighed.points.x) <= CERTIFIED_ROWS
@@ -164,7 +175,7 @@ class LaggedTerms:
         """
         if named is None:
             named = bias_table(self, declared, certify=False, every=False)
-        usual = seen_table(self, (*self.catalogue.usual(), *self.catalogue.two_lags()))
+        usual = seen_table(self, (*self.usual(), *self.catalogue.two_lags()))
         families = seen_table(self, self.catalogue.families())
         families = [entry for entry in families if (entry.cosine or 0.0) <= MOST_PHYSICS]
         zones = [entry.suspect for entry in (*named, *usual, *families)]
@@ -239,7 +250,12 @@ def bias_under(
     """
     named = bool(suspects)
     certify = named or (certify_usual and terms.certifies)
-    table = bias_table(terms, suspects or terms.catalogue.usual(), certify=certify, every=named)
+    table = bias_table(
+        terms,
+        suspects or terms.usual(),
+        certify=certify,
+        every=named,
+    )
     return [entry.as_dict() for entry in table]
 
 
