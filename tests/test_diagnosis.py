@@ -790,3 +790,22 @@ def test_samples_at_a_limit_come_before_the_missing_terms_of_a_motion():
     assert "First look at samples at a limit: y is 10 on" in texts[10.0]
     limit, term = texts[10.0].index("at a limit"), texts[10.0].index(" Otherwise ")
     assert "most likely" in texts[10.0][term:] and limit < term
+
+
+@pytest.mark.parametrize("fed_back", [True, False])
+def test_under_feedback_no_text_advises_the_free_run(fed_back):
+    rng, u, y, d = np.random.default_rng(1), np.zeros(500), np.zeros(500), 0.0
+    reference = np.repeat(rng.normal(size=20), 25)
+    for k in range(500):
+        d = 0.8 * d + 0.1 * rng.normal()
+        if k:
+            y[k] = 0.8 * y[k - 1] + 0.5 * u[k - 1] + d
+        u[k] = 0.6 * (reference[k] - fed_back * y[k]) + 0.05 * rng.normal()
+    physics = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")])
+    record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["y"])
+    found = oa.estimate(record, physics, learner=None, criterion=oa.Prediction()).diagnose()
+    text = " ".join([found.residuals.text, *(one.text for one in found.warnings)])
+    assert '[noise] model = "auto"' in text
+    assert ('focus = "simulation"' in text) != fed_back
+    assert not fed_back or "Instrumental variables" not in text
+    assert ("no remedy here: the inputs follow the outputs" in text) == fed_back

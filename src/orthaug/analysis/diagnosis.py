@@ -26,6 +26,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import join_words, percent
 from orthaug._base.parallel import one_blas_thread
 from orthaug.analysis.changes import Change, fall_of, model_changes, own_share
+from orthaug.analysis.closed_loop import feedback_in
 from orthaug.analysis.exchanged_inputs import exchanged_inputs, misread_inputs
 from orthaug.analysis.input_timing import LateInput, find_late_inputs, on_longest
 from orthaug.analysis.missing_terms import missing_terms
@@ -215,7 +216,7 @@ def _of_motion(
     explained = explained or bool(late or misread)
     verdict = "unmodelled" if explained else "white" if white else "equation_noise"
     limits = "" if white else _at_limits(record, free_run, errors, inputs, motion.held)
-    lacking = (lacks or several, late, coarse, slight, misread, limits)
+    lacking = (lacks or several, late, coarse, slight, misread, limits, missing)
     text = free_run_words(verdict, fit, tests, shares, followed, curved, *lacking)
     warnings = [restarted[1]] if restarted and restarted[1] else []
     warnings += [*misread, *(one.warning for one in late)]
@@ -428,7 +429,9 @@ def _inconsistent(
     """
     with one_blas_thread():
         found = inconsistency(fit, one_step, free_run)
-    return found.warning if found is not None and found.found else None
+    if found is None or not found.found:
+        return None
+    return found.warning(looped=bool(feedback_in(fit.problem.record)))
 
 
 def _steps(problem: Problem, tests: tuple[ResidualTest, ...]) -> dict[str, float]:
@@ -483,9 +486,10 @@ def _with_criterion(
 ) -> tuple[Change, ...]:
     """Return the changes of a one-step fit, with the change of criterion.
 
-    It comes first where noise is on the sensor, else only if there is no other.
+    It comes first where noise is on the sensor, else only if there is no other. Under feedback it
+    is no remedy.
     """
-    if not trained:
+    if not trained or seen.looped:
         return seen.changes
     (run, skip), unit = trained[0], seen.fit.problem.deviation
     after = float(np.mean((rms_errors(run, skip) / unit) ** 2))

@@ -56,6 +56,22 @@ class Placed:
         return f"{'in' if self.beside is None else 'beside'} {self.place}"
 
 
+_DOUBTFUL = 0.05  # p of missing terms below which no parameter is read as physics
+_NAMED = 0.5  # share of the errors from which such terms count
+
+
+def may_be_missing(p: float | None, share: float | None) -> bool:
+    """Return whether terms explain most of coloured errors, which need not be surely missing.
+
+    Disturbances and missing physics both colour errors, and few rows do not tell them apart.
+
+    Args:
+        p: that nothing is missing.
+        share: of the errors' variance that the terms explain together.
+    """
+    return (p or 0.0) < _DOUBTFUL and (share or 0.0) > _NAMED
+
+
 @dataclass(frozen=True)
 class MissingTerm(Placed):
     """A term that could be added: its equation, its variable, its shape, and what it would explain.

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from orthaug._base.errors import Warning
 from orthaug._base.lines import join_words, percent
 from orthaug.analysis.changes import WORTH, Change, fall_of
+from orthaug.analysis.closed_loop import feedback_in
 from orthaug.analysis.input_timing import LateInput
-from orthaug.analysis.missing_term import SHAPES, MissingTerm
+from orthaug.analysis.missing_term import SHAPES, MissingTerm, may_be_missing
 from orthaug.analysis.missing_terms import MissingTest
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.quantised_output import QuantisedOutput
 from orthaug.analysis.residuals import ResidualTest
+from orthaug.fitting.inconsistency import UNDER_FEEDBACK
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.response import Response
@@ -26,18 +29,19 @@ _MOST_OF_IT = 0.5  # of the errors' mean square, from which on a term is likely 
 _LISTED = 5  # findings that a text lists at most
 _TOO_FAST = 0.05  # noise variance / smallest variance among the lagged outputs
 
-_BIASED = Warning(
-    "sensor_noise",
-    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias. "
-    'Training on the free run (focus = "simulation") has none, and a noise model ([noise] '
-    'model = "auto") takes it into account.',
+_BIASED = (
+    "noise on the measured output biases the one-step θ, and its intervals do not cover that bias."
 )
-_INCONSISTENT = Warning(
-    "coloured_residual",
+_INCONSISTENT = (
     "the one-step residual is coloured: a disturbance of one row is in the lagged outputs of the "
-    "next. That biases the one-step θ, and its intervals do not cover that bias. Training on the "
-    'free run (focus = "simulation") has none, and a noise model ([noise] model = "auto") takes it '
-    "into account.",
+    "next. That biases the one-step θ, and its intervals do not cover that bias."
+)
+_UNBIASED = (
+    'Training on the free run (focus = "simulation") has none, and a noise model ([noise] '
+    'model = "auto") takes it into account.'
+)
+_UNBIASED_IN_LOOP = (
+    f'A noise model ([noise] model = "auto") takes it into account. {UNDER_FEEDBACK}'
 )
 _LEFT = Warning(
     "coloured_residual",
@@ -114,6 +118,16 @@ class Finding:
     give.
     """
 
+    @cached_property
+    def looped(self) -> bool:
+        """True if the inputs follow the outputs: disturbances that are fed back bias a free run."""
+        return bool(feedback_in(self.fit.problem.record))
+
+    @property
+    def unbiased(self) -> str:
+        """What has no bias by the colour of the errors, in words."""
+        return _UNBIASED_IN_LOOP if self.looped else _UNBIASED
+
     @property
     def lacks(self) -> bool:
         """True if a change of the model itself is worth making."""
@@ -164,7 +178,9 @@ def words(verdict: str, seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     ):
         warnings = (
             *warnings,
-            _LEFT if seen.fit.model.coloured else _INCONSISTENT,
+            _LEFT
+            if seen.fit.model.coloured
+            else Warning("coloured_residual", f"{_INCONSISTENT} {seen.unbiased}"),
         )  # where the physics lacks something, a model of the colour gives no θ
     elif verdict != "sensor_noise" and seen.inconsistent is not None:
         return f"{text} {_OFF}", (*warnings, seen.inconsistent)
@@ -243,8 +259,9 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
     if seen.simulated:
         more = f" {_sentence(seen.changes[0])}" if seen.changes else ""
         return f"{text}: the simulation criterion is the right one.{more}", ()
-    text += '. One-step estimates of θ are then inconsistent, those of focus = "simulation" are not'
-    if seen.changes and seen.changes[0].kind == "criterion":
+    text += ". One-step estimates of θ are then inconsistent"
+    text += "" if seen.looped else ', those of focus = "simulation" are not'
+    if not seen.looped and seen.changes and seen.changes[0].kind == "criterion":
         fall = seen.changes[0].fall
         text += (
             f"; that focus is predicted to lower the error of the free run by {percent(fall)}"
@@ -257,7 +274,8 @@ def _sensor_noise(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
             "outputs: the sampling is too fast for one-step estimation"
         )
     steps = f" {_quantisation_text(seen)}" if seen.steps else ""
-    return f"{text}.{steps}", (_BIASED,) if seen.fit.std is not None else ()
+    biased = Warning("sensor_noise", f"{_BIASED} {seen.unbiased}")
+    return f"{text}.{steps}", (biased,) if seen.fit.std is not None else ()
 
 
 def _unmodelled_text(seen: Finding) -> tuple[str, tuple[Warning, ...]]:
@@ -290,7 +308,9 @@ def _quantisation_text(seen: Finding) -> str:
         for test in seen.tests
         if test.name in seen.steps
     }
-    trained = "" if seen.simulated else 'training on the free run (focus = "simulation"), '
+    trained = (
+        "" if seen.simulated or seen.looped else 'training on the free run (focus = "simulation"), '
+    )
     return (
         f"{'; '.join(each.values())}: these steps make it coloured, as noise on the output "
         f"does, and bias one-step estimates of θ. Remedies: {trained}fewer samples (`decimate` "
@@ -409,6 +429,7 @@ def free_run_words(
     slight: MissingTest | None = None,
     misread: tuple[Warning, ...] = (),
     limits: str = "",
+    unsure: MissingTest | None = None,
 ) -> str:
     """Return the verdict on a motion's free run in words, with its reason.
 
@@ -417,6 +438,7 @@ def free_run_words(
         misread: what the record shows of inputs that are read wrongly.
         coarse: the steps of the outputs, where these are most of the error.
         limits: sentences on samples at a limit, which come first.
+        unsure: the test of missing terms, whatever it says.
     """
     units = {c.name: c.unit for c in fit.problem.record.outputs}
     sizes = ", ".join(f"{s.rms:.3g} {units[s.name]}".strip() + f" of {s.name}" for s in shares)
@@ -456,6 +478,12 @@ def free_run_words(
                 f"{percent(best.share)} of its mean square: little, but it may move parameters. "
             )
             cause = "The cause of the rest is"
+        elif unsure is not None and may_be_missing(unsure.p, unsure.share):
+            no_term = (
+                f"{'no input and ' if inputs else ''}no state at the same instant behind it. Terms "
+                f"that the equations may lack explain {percent(unsure.share)} of it together, "
+                f"though not surely (p = {unsure.p:.2g}). "
+            )
         return (
             f"{subject} ({sizes}) is coloured ({colour}). {before}The tests of the residual "
             f"find {no_term}{cause} {fed}disturbances, or physics missing in an equation "

@@ -33,6 +33,10 @@ from orthaug.models.response import Response
 from orthaug.models.statistics import prior_of
 from orthaug.physics.streamed import StreamedProblem
 
+UNDER_FEEDBACK = (
+    "Training on the free run is no remedy here: the inputs follow the outputs, and disturbances "
+    "that are fed back bias it."
+)
 LEVEL = 0.03  # of the test; benchmarks/coverage_noise.py has its false alarms
 _WORTH = 0.5  # standard errors of θ: by less, coverage falls from 95 to 92 % at most
 _LISTED = 3  # parameters in a warning, at most
@@ -74,9 +78,12 @@ class Inconsistency:
         order = np.argsort(-np.abs(self.apart), kind="stable")
         return [int(i) for i in order if abs(self.apart[i]) > _WORTH]
 
-    @property
-    def warning(self) -> Warning:
-        """Warning on the inconsistency, with the values that the remedies give."""
+    def warning(self, *, looped: bool = False) -> Warning:
+        """Return the warning on the inconsistency, with the values that the remedies give.
+
+        Args:
+            looped: whether the inputs follow the outputs, so that the free run is no remedy.
+        """
         each = [
             f"{self.names[i]} is {self.modelled[i]:.6g} (std {self.modelled_std[i]:.2g}) "
             f"instead of {self.theta[i]:.6g}, {abs(self.apart[i]):.1f} standard errors away"
@@ -89,16 +96,19 @@ class Inconsistency:
             "lagged outputs, and more rows do not reduce the bias. With a noise model "
             f"(autoregression of order {self.order}) {'; '.join(each)}{others}."
         )
-        if self.instruments is not None and self.instruments_std is not None:
+        instruments = None if looped else self.instruments  # in a loop u has the disturbance, too
+        if instruments is not None and self.instruments_std is not None:
             given = [
-                f"{self.names[i]} = {self.instruments[i]:.6g} (std {self.instruments_std[i]:.2g})"
+                f"{self.names[i]} = {instruments[i]:.6g} (std {self.instruments_std[i]:.2g})"
                 for i in self.moved[:_LISTED]
             ]
             text += (
                 f" Instrumental variables (the outputs of the free run) give {', '.join(given)}."
             )
         remedy = (
-            'Train with a noise model ([noise] model = "auto"): training on the free run was '
+            f'Train with a noise model ([noise] model = "auto"). {UNDER_FEEDBACK}'
+            if looped
+            else 'Train with a noise model ([noise] model = "auto"): training on the free run was '
             "tried, and is not better."
             if self.compared
             else 'Train on the free run (focus = "simulation"), which does not have it, or with a '
