@@ -15,6 +15,7 @@ from orthaug.analysis.findings import (
     DiagnosisResult,
     MissingResult,
     MotionFitResult,
+    SharedResult,
     ValidationResult,
 )
 from orthaug.analysis.fit_findings import (
@@ -314,3 +315,19 @@ def test_a_learner_that_does_not_help_is_no_reason_to_leave_parameters_undetermi
         update={"residuals": told().model_copy(update={"verdict": "unmodelled"})}
     )
     assert "without it" not in fit_verdict(doubted).use
+
+
+def test_what_is_in_doubt_beside_the_learner_is_not_read_as_physics():
+    doubt = "training had not converged"
+    shared = SharedResult.model_construct(withdrawn=["a"], doubt=doubt)
+    said = fit_verdict(fitted().model_copy(update={"shared": shared}))
+    assert f"Do not read a as physics yet: {doubt}" in said.use
+    clear = SharedResult.model_construct(withdrawn=None, doubt=None)
+    said = fit_verdict(fitted().model_copy(update={"shared": clear}))
+    assert "to read a as physics" in said.use
+
+
+def test_a_parameter_without_an_interval_is_not_called_uncertain():
+    bare = KNOWN.model_copy(update={"name": "b", "std": None, "ci95": None})
+    use = fit_verdict(fitted(parameters=[KNOWN, bare])).use
+    assert "read a as physics. b has no interval" in use and "too uncertain" not in use

@@ -12,12 +12,12 @@ from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
+from orthaug.analysis.missing_term import may_be_missing
 from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
-_DOUBTFUL = 0.05  # p of missing terms below which no parameter is read as physics
 _COARSE = 0.5  # standard errors that finer integration may move a parameter
 _SURE = 0.1  # standard error over value up to which a parameter counts as known
 _NAMED = 0.5  # share of the learned part from which its cause is the first advice
@@ -442,9 +442,13 @@ def _use_text(result: FitResult, level: str) -> str:
     sure = [row.name for row in rows if _is_known(row) and row.name not in coarse]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
     doubted = untested or is_biased_by_feedback(result) or _may_lack_terms(result)
-    known = sure if _noise_alone(result) and not doubted else []
+    imitable = getattr(result, "shared", None)  # of results of older versions there is none
+    unclear = imitable.withdrawn or [] if imitable is not None else []
+    clear = [name for name in sure if name not in unclear]
+    known = clear if _noise_alone(result) and not doubted else []
     shared = [row.name for row in rows if row.shared]
-    others = [row.name for row in rows if row.name not in (*sure, *shared)]
+    bare = [row.name for row in rows if row.std is None and not row.shared]
+    others = [row.name for row in rows if row.name not in (*sure, *shared, *bare)]
     ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if _has_warning(result, _NO_FREEDOM):
@@ -466,16 +470,19 @@ def _use_text(result: FitResult, level: str) -> str:
     else:
         text = f"simulate{' and predict' if predicts else ''} within the range of its training data"
     text += f" and to read {join_words(known)} as physics" if known else ""
-    if sure and not known:
-        cover = "interval does" if len(sure) == 1 else "intervals do"
-        text += (
-            f". Do not read {join_words(sure)} as physics yet: the {cover} not include what "
-            + (
-                "the residual still contains"
-                if not _noise_alone(result) or _may_lack_terms(result)
-                else "the warning names"
-            )
-        )
+    if unread := [name for name in sure if name not in known]:
+        cover = "interval does" if len(unread) == 1 else "intervals do"
+        text += f". Do not read {join_words(unread)} as physics yet: "
+        if not _noise_alone(result) or _may_lack_terms(result):
+            text += f"the {cover} not include what the residual still contains"
+        elif doubted or imitable is None or not imitable.doubt:
+            text += f"the {cover} not include what the warning names"
+        else:
+            text += imitable.doubt
+    if bare:
+        several = len(bare) > 1
+        text += f". {join_words(bare)} {'have no intervals' if several else 'has no interval'}"
+        text += f", which would say how close to physics {'they are' if several else 'it is'}"
     text += (
         f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
         "physics"
@@ -494,14 +501,11 @@ def _use_text(result: FitResult, level: str) -> str:
 
 
 def _may_lack_terms(result: FitResult | RowResult) -> bool:
-    """Return whether terms explain most of a coloured error, which is less than sure.
-
-    Disturbances and missing physics both colour it, and few rows do not tell them apart.
-    """
+    """Return whether terms explain most of a coloured error, which is less than sure."""
     found = result.residuals
     if found is None or found.verdict != "equation_noise" or found.missing is None:
         return False
-    return (found.missing.p or 0.0) < _DOUBTFUL and (found.missing.share or 0.0) > _NAMED
+    return may_be_missing(found.missing.p, found.missing.share)
 
 
 def _noise_alone(result: FitResult | RowResult) -> bool:
