@@ -834,7 +834,7 @@ def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
     assert first.change["learner.kind"] == "none"
     assert first.change["baseline.terms"][-1]["regressor"] == "v[k-1]*u[k-1]"
     assert "in place of the learner" in first.text
-    assert "No learner then imitates a and b." in first.text
+    assert "No learner then imitates a and b; their intervals hold for this form" in first.text
     assert first.after < 1.05 * first.before
 
 
@@ -848,5 +848,5 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
     options: dict[str, Any] = {"slow": True, "freed": ["a", "b"]}
     (advice,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
     assert "is as good" in advice.text and "may be chance" not in advice.text
-    assert advice.text.endswith("No learner then imitates a and b.")
+    assert advice.text.endswith("imitates a and b; their intervals hold for this form alone.")
     assert "does not surely improve it, and which is as good without the learner." in trials.text

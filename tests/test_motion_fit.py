@@ -10,7 +10,7 @@ import scipy.integrate
 
 import orthaug as oa
 from orthaug.analysis.learned_part import learned_reach
-from orthaug.analysis.missing_terms import doubted_equations
+from orthaug.analysis.missing_terms import MissingTest, doubted_equations
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
@@ -788,3 +788,30 @@ def test_the_unit_of_an_output_moves_no_parameter():
         fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation(0, 0))
         found.append([fit.values, fit.std])
     np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
+
+
+def test_terms_that_may_be_missing_are_not_denied(monkeypatch):
+    """The verdict keeps parameters from being read by them, so the text has them, too."""
+    rng, rows = np.random.default_rng(2), 200
+    u, y, d = np.repeat(rng.normal(size=40), 5), np.zeros(rows), 0.0
+    for k in range(1, rows):
+        d = 0.7 * d + 0.05 * rng.normal()
+        y[k] = 0.9 * y[k - 1] + 0.1 * u[k - 1] + d
+    motion = oa.Motion.from_equations(
+        states=[oa.State("a", "c*(u - a)", start="y")],
+        outputs=[oa.Output("y", "a")],
+        inputs=["u"],
+        parameters=[oa.PhysicalParameter("c", 0.1)],
+    )
+    record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["y"])
+    fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation(0, 0))
+    texts = []
+    for p in (0.3, 0.03):
+        test = MissingTest(p, (2, 100), 0.9, ())
+        monkeypatch.setattr("orthaug.analysis.diagnosis.missing_terms", lambda fit, test=test: test)
+        found = oa.diagnose(fit)
+        assert found.verdict == "equation_noise"
+        texts.append(found.text)
+    assert "no simple missing term behind it" in texts[0]
+    assert "no simple missing term" not in texts[1]
+    assert "may lack explain 90 % of it together, though not surely (p = 0.03)" in texts[1]

@@ -480,7 +480,10 @@ def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows, *, lo
 
 def _freed_text(names: Sequence[str]) -> str:
     """Return what a fit without a learner is good for, as a sentence."""
-    return f" No learner then imitates {join_words(names)}." if names else ""
+    if not names:
+        return ""
+    intervals = "its interval holds" if len(names) == 1 else "their intervals hold"
+    return f" No learner then imitates {join_words(names)}; {intervals} for this form alone."
 
 
 def _error_text(one: ProposalErrors, before: float) -> str:
