@@ -384,7 +384,7 @@ def by_single_number(path: Path) -> Clock:
 def _column_clock(column: Column, seconds: Vector) -> Clock:
     steps = np.diff(seconds[np.isfinite(seconds)])
     usual = float(np.median(steps))
-    even = column.missing > 0 or bool((np.abs(steps - usual) <= JITTER * usual).all())
-    even = even and not steps_accumulate(seconds[np.isfinite(seconds)])
+    alike = bool((np.abs(steps - usual) <= JITTER * usual).all())
+    even = column.missing > 0 or (alike and not steps_accumulate(seconds))
     step = float(steps.mean()) if even and not column.missing else usual
     return Clock(float(f"{step:.9g}"), column, seconds, even=even)
