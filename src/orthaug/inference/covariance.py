@@ -66,11 +66,8 @@ def whitening_matrix(noise: Matrix, deviation: Vector) -> Matrix | None:
     None for a covariance that is singular, as of outputs without errors: in the outputs' deviations
     (ny,), for a position in m and a pressure in Pa differ by units alone.
     """
-    noise = noise / np.outer(deviation, deviation)
-    values = np.linalg.eigvalsh(noise)
-    if not values[0] > 1e-12 * values[-1]:
-        return None
-    return np.linalg.inv(np.linalg.cholesky(noise)) / deviation
+    values = np.linalg.eigvalsh(noise / np.outer(deviation, deviation))
+    return np.linalg.inv(np.linalg.cholesky(noise)) if values[0] > 1e-12 * values[-1] else None
 
 
 def mixing_matrix(noise: Matrix) -> Matrix:
