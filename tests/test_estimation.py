@@ -448,6 +448,11 @@ def test_theta_keeps_its_intervals_where_training_does_not_move_it(short):
         in result["not_converged"]
     )
     assert "Without the key `iterations`, training continues" in result["not_converged"]
+    # Nobody gave the key where a run has the default limit and is not to pass it
+    usual = options | {"learner": MLP(hidden=(16,)), "solver": LevenbergMarquardt().within_limit}
+    found = estimate(record, PHYSICS, structure=moved, **usual)
+    result = {warning.code: warning.text for warning in found.warnings}
+    assert found.status.iterations == 300 and "Without the key" not in result["not_converged"]
     flown = estimate(record, PHYSICS, criterion=oa.Simulation(30, 0), **options | {"blocks": 0})
     assert flown.std is None and "not_converged" in {warning.code for warning in flown.warnings}
 

@@ -14,6 +14,7 @@ from orthaug._base.errors import Warning
 from orthaug._base.lines import percent, plural
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.learned import TrainedLearner
+from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.solvers.limit import Tail, noticeable_in
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
@@ -77,7 +78,7 @@ def not_converged(learned: TrainedLearner) -> Warning:
             "Take a smaller learner or a stronger regularization, which converge sooner, or "
             "allow more `iterations`"
         )
-    if not learned.tail.prolonged:
+    if not learned.tail.prolonged and learned.tail.limit != LevenbergMarquardt().iterations:
         text += (
             ". Without the key `iterations`, training continues while the loss falls, up to "
             "3000 iterations"
