@@ -1,7 +1,10 @@
 """Inputs that act later than in the equations are found beside slow disturbances, too."""
 
+import json
+
 import numpy as np
 import pytest
+from test_cli import run
 
 import orthaug as oa
 
@@ -116,3 +119,44 @@ def test_a_discrete_plant_without_delay_is_not_moved():
     """Its equations have u act a sample later; that it acts at once is no fault of the logger."""
     found = oa.estimate(logged(-1), STEPS, learner=None).diagnose().residuals
     assert found.verdict == "unmodelled" and found.late == []
+
+
+def test_a_run_in_the_wrong_phase_is_no_delay(tmp_path):
+    """Its errors are the oscillation itself, which their own past predicts better than others."""
+    rng, step, w = np.random.default_rng(0), 0.0016, 2 * np.pi * 70
+    tones, phases = np.arange(40.0, 100.0, 3.0), rng.uniform(0, 2 * np.pi, 20)
+    u = 0.3 * np.cos(2 * np.pi * tones * step * np.arange(300)[:, None] + phases).sum(axis=1)
+    x, v, y = 0.0, 0.0, np.empty(300)
+    for k in range(300):
+        y[k] = x
+        for _ in range(10):
+            v += step / 10 * (w**2 * (u[k] - x) - 0.1 * w * v)
+            x += step / 10 * v
+    logged = u + 1.2 * rng.normal(size=300)  # by a noisy sensor
+    table = np.column_stack([logged, y + 1e-3 * rng.normal(size=300)])
+    np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="u,y", comments="")
+    (tmp_path / "spec.toml").write_text(OSCILLATOR)
+    done = run("check", tmp_path / "spec.toml", "--json")
+    assert done.code == 0, done.err
+    codes = {warning["code"] for warning in json.loads(done.out)["warnings"]}
+    assert not codes & {"dead_time", "slow_input", "late_rows"}
+
+
+OSCILLATOR = """
+[data]
+sampling_time = 0.0016
+inputs = ["u"]
+outputs = ["y"]
+train = { files = ["run.csv"] }
+[motion.states]
+x = { derivative = "v", start = "y" }
+v = { derivative = "(u - c*v - k*x)/m", start = "derivative of y" }
+[motion.outputs]
+y = "x"
+[motion.parameters]
+m = { initial = 6e-6, min = 0 }
+c = { initial = 2e-4, min = 0 }
+k = { initial = 1.2, min = 0 }
+[learner]
+kind = "none"
+"""

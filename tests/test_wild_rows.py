@@ -243,3 +243,18 @@ def test_rows_written_twice_and_a_frozen_sensor_are_named(tmp_path, wrong, code)
     measured(tmp_path, wrong)
     text = text_of(told(tmp_path, SPEC), code)
     assert "run.csv" in text and ("every = 2" in text or "row 100" in text)
+
+
+def test_a_sensor_at_its_limit_is_not_frozen(tmp_path):
+    """It comes to the limit and leaves it gradually; a value that jumps at the end was frozen."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=10), 40)
+    y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u) + 0.002 * rng.normal(size=400)
+    limited = np.minimum(y, np.percentile(y, 94))
+    frozen = np.where(np.abs(np.arange(400) - 115) < 15, y.max() + 0.5, y)
+    for cells, is_frozen in ((limited, False), (frozen, True)):
+        table = np.column_stack([u, cells])
+        np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="u,y", comments="")
+        found = {warning["code"] for warning in told(tmp_path, SPEC)["warnings"]}
+        assert ("frozen_output" in found) == is_frozen
+        assert is_frozen or "saturated_output" in found

@@ -328,7 +328,8 @@ def find_late_inputs(task: MotionTask, solver: Solver) -> tuple[LateInput, ...]:
     delay helps, a lag's time constant is sought in the same way.
     Physics alone is refitted each time from where the nearest one ended. A lag of the input acts
     on linear physics as one of every sensor. Where no delay helps, the input is advanced by a
-    sample or two: rows that a logger writes late act so.
+    sample or two: rows that a logger writes late act so. Where the whole error shows nothing, what
+    its own past does not predict of it decides, among changes that do not raise the whole.
 
     Args:
         task: with physics alone trained; what it leaves is set against.
@@ -344,7 +345,15 @@ def find_late_inputs(task: MotionTask, solver: Solver) -> tuple[LateInput, ...]:
         for number in range(len(names))
         for change in (_delay, _lag)
     }
-    for measure in (residual_of, _unpredicted):
+    whole_error = residual_of(*declared)
+
+    def unpredicted(segmented: SegmentedMotion, free_fit: FreeRunFit | None) -> float:
+        # A run in the wrong phase errs by an oscillation, which its own past predicts
+        if residual_of(segmented, free_fit) > whole_error:
+            return float("inf")
+        return _unpredicted(segmented, free_fit)
+
+    for measure in (residual_of, unpredicted):
         for number, name in enumerate(names):
             if name in found:
                 continue

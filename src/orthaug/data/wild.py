@@ -38,6 +38,7 @@ _NAMED = 3
 _FEWEST = 20  # samples of a channel
 _FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
+_GRADUAL = 3.0  # RMS of an output's steps, up to which it comes to a limit and leaves it
 _REPEATS = 2  # single rows that repeat the one before, at least
 _MOVING = 0.01  # of the deviation of its steps: by less an output rests
 _BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
@@ -377,6 +378,8 @@ def _frozen_warnings(record: Record) -> list[Warning]:
             moves = np.ptp(block, axis=0) > 0.1 * np.maximum(experiment.inputs.std(axis=0), 1e-300)
             if experiment.inputs.shape[1] and not moves.any():
                 continue
+            if _ends_at_limit(y, begin, rows):
+                continue
             text = (
                 f"{experiment.where(begin)}: {output.name} is {y[begin]:.6g} for "
                 f"{plural(rows + 1, 'row')} from here on ({percent((rows + 1) / n)} of them), "
@@ -386,6 +389,17 @@ def _frozen_warnings(record: Record) -> list[Warning]:
             found.append(Warning("frozen_output", text))
             break
     return found
+
+
+def _ends_at_limit(y: Vector, begin: int, rows: int) -> bool:
+    """Return whether a signal stays at its extreme value, which it reaches and leaves gradually.
+
+    A limit of sensor or plant, which `saturated_output` is about; what freezes jumps at its end.
+    """
+    steps = np.diff(y)
+    around = [steps[row] for row in (begin - 1, begin + rows) if 0 <= row < len(steps)]
+    usual = _GRADUAL * float(np.sqrt(np.mean(steps[steps != 0] ** 2)))
+    return bool(y[begin] in (y.min(), y.max()) and np.all(np.abs(around) <= usual))
 
 
 def _longest_stretch(same: np.ndarray) -> tuple[int, int]:
