@@ -326,6 +326,20 @@ def test_a_threshold_that_is_known():
     assert 2 < stability(model, driven(model, u)).diverges_at <= 2.1
 
 
+def test_a_root_of_a_negative_number_is_no_growth():
+    """A level y = y − 0.2 √(y + 100) + u, u = 1 ± 0.5, ends at −100 where u is scaled to below 0."""
+    model = model_of(
+        [Term("a", "y[k-1]"), Term("c", "sqrt(y[k-1] + 100)"), Term("b", "u[k-1]")],
+        [1.0, -0.2, 1.0],
+        largest=100.0,
+    )
+    u = 1 + np.tile(np.repeat([0.5, -0.5], 50), 4)
+    found = stability(model, driven(model, u, -75.0))
+    assert 2 < found.diverges_at < 8
+    assert "meets a term that has no value" in found.text and "max(x, 0)" in found.text
+    assert "a million times" not in found.text
+
+
 def test_a_model_without_inputs_has_none_to_scale():
     """y[k] = a y[k-1] decays or explodes from where it starts."""
     for a, says in (

@@ -25,6 +25,7 @@ from orthaug.physics.motion import MOST_SUBSTEPS
 _LARGEST_FACTOR = 1e4
 _SIDE_BY_SIDE = 16  # runs of one compiled call
 _MARGIN = 1.5  # a factor below is a warning
+_WITHIN = 10.0  # times the largest training output: a run there did not grow out of all numbers
 _CLOSE = 1.05  # ratio of two factors at which the bisection ends
 _FINER, _REFINEMENTS = 4, 3  # times the substeps, and how often: rk4's error falls to 1/256 each
 
@@ -36,7 +37,8 @@ class Divergence:
     """The factor on the inputs from which the free run leaves all bounds; None: nowhere.
 
     It is searched up to `searched`. With the model's own `substeps` the integrator itself leaves
-    them from `coarse` on, and with `finer` ones it does not; None where that is not so.
+    them from `coarse` on, and with `finer` ones it does not; None where that is not so. It may be
+    `undefined`: not large, but without a value, as the root of a negative number.
     """
 
     factor: float | None
@@ -44,6 +46,7 @@ class Divergence:
     coarse: float | None = None
     substeps: int = 0
     finer: int = 0
+    undefined: bool = False
 
 
 def find_divergence(model: Model, record: Record, largest: float = 1024.0) -> Divergence:
@@ -56,6 +59,16 @@ def find_divergence(model: Model, record: Record, largest: float = 1024.0) -> Di
     Raises:
         InputError: as `divergence_scaling`.
     """
+    found = _find_confirmed(model, record, largest)
+    if found.factor is None:
+        return found
+    fine = _with_substeps(model, found.finer) if found.finer else model
+    _, undefined = _run_scaled(fine, _first_rows(fine, record), [found.factor])
+    return replace(found, undefined=bool(undefined[0]))
+
+
+def _find_confirmed(model: Model, record: Record, largest: float) -> Divergence:
+    """Return the factor that finer steps confirm, as `find_divergence`."""
     coarse = factor = divergence_scaling(model, record, largest)
     motion = getattr(model.form, "motion", None)
     if factor is None or motion is None or motion.scheme.discrete:
@@ -142,12 +155,16 @@ def describe_divergence(found: Divergence, driven: bool) -> tuple[str, str]:
     stays, times = (
         ("remains bounded", found.searched)
         if factor is None
+        else ("meets a term that has no value, as the root of a negative number,", factor)
+        if found.undefined
         else ("exceeds the training outputs a million times", factor)
     )
     text = (
         f"The free run {stays} with the inputs' deviations from their means {times:.4g} times "
         "as large."
     )
+    if found.undefined:
+        text += " Where the physics has such a term, sqrt(max(x, 0)) has a value everywhere."
     if found.coarse is not None:
         text += (
             f" That holds for {found.finer} substeps of the integrator. With "
@@ -228,9 +245,19 @@ def _find_diverging(
 ) -> Bool[np.ndarray, "f"]:
     """Return whether the free run diverges with its inputs scaled by each of up to 16 factors.
 
-    A factor scales the inputs' deviations from their means.
+    Raises:
+        InputError: as `_run_scaled`.
+    """
+    return _run_scaled(model, record, factors)[0]
 
-    The runs start from the measured outputs of each experiment and go side by side.
+
+def _run_scaled(
+    model: Model, record: Record, factors: Sequence[float]
+) -> tuple[Bool[np.ndarray, "f"], Bool[np.ndarray, "f"]]:
+    """Return whether the free run diverges with scaled inputs, and whether it has no value there.
+
+    A factor, of up to 16, scales the inputs' deviations from their means. The runs start from the
+    measured outputs of each experiment and go side by side.
 
     Raises:
         InputError: a record that does not fit the model, or has no outputs to start from.
@@ -243,7 +270,7 @@ def _find_diverging(
     record = usable(model, record)
     mean = np.concatenate([e.inputs for e in record.experiments]).mean(axis=0)
     scales = np.concatenate([factors, np.repeat(factors[:1], _SIDE_BY_SIDE - len(factors))])
-    wild = np.zeros(_SIDE_BY_SIDE, dtype=bool)
+    wild, undefined = np.zeros((2, _SIDE_BY_SIDE), dtype=bool)
     for experiment in record.experiments:
         if wild.all():
             break
@@ -257,10 +284,10 @@ def _find_diverging(
             form.start(experiment.outputs, [form.first_row])[0],
             RUNAWAY * model.largest_output,
         )
-        wild |= np.asarray(
-            _side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound)
-        )
-    return wild[: len(factors)]
+        own, lost = _side_by_side(form, model.numbers, state, *padded, len(inputs), scales, bound)
+        undefined |= ~wild & np.asarray(lost)
+        wild |= np.asarray(own)
+    return wild[: len(factors)], undefined[: len(factors)]
 
 
 @partial(quick_jit, static_argnames="form")
@@ -273,22 +300,29 @@ def _side_by_side(
     steps: Array,
     factors: Float[Array, "f"],
     bound: Float[Array, "ny"],
-) -> Bool[Array, "f"]:
+) -> tuple[Bool[Array, "f"], Bool[Array, "f"]]:
     """Return whether an output leaves `bound` within `steps` of each scaled free run.
 
+    The second are those that leave it for no number, from outputs that were not large.
     The inputs of a run are `resting + factor (inputs − resting)`.
     """
     one = jax.vmap(lambda state, row: form.step(numbers, state, row))
+    near = bound * (_WITHIN / RUNAWAY)
 
-    def is_unfinished(carry: tuple[Any, Any, Any]) -> Array:
+    def is_unfinished(carry: tuple[Any, ...]) -> Array:
         return (carry[0] < steps) & ~carry[2].all()
 
-    def step(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
-        k, states, wild = carry
+    def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        k, states, wild, small, undefined = carry
         states, parts = one(states, resting[k] + factors[:, None] * (inputs[k] - resting[k]))
-        return k + 1, states, wild | ~(jnp.abs(parts.total) <= bound).all(axis=1)
+        y = parts.total
+        lost = ~wild & small & jnp.isnan(y).any(axis=1)
+        wild = wild | ~(jnp.abs(y) <= bound).all(axis=1)
+        return k + 1, states, wild, (jnp.abs(y) <= near).all(axis=1), undefined | lost
 
     states = jnp.broadcast_to(state, (len(factors), *state.shape))
-    return jax.lax.while_loop(
-        is_unfinished, step, (0, states, jnp.zeros(len(factors), dtype=bool))
-    )[2]
+    none = jnp.zeros(len(factors), dtype=bool)
+    _, _, wild, _, undefined = jax.lax.while_loop(
+        is_unfinished, step, (0, states, none, ~none, none)
+    )
+    return wild, undefined
