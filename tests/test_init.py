@@ -1095,6 +1095,23 @@ def test_the_stated_error_is_what_a_fit_gives_on_the_same_rows(tmp_path, monkeyp
     assert float(f"{100 * nrmse:.3g}") == float(stated[1])
 
 
+@pytest.mark.parametrize("order", [1, 5])
+def test_the_error_after_a_fit_of_the_free_run_is_stated_where_it_is_clearly_less(tmp_path, order):
+    """One step ahead lags that are too few follow the last output; a fit of the run does not."""
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.normal(size=200), 3)
+    y = scipy.signal.lfilter([0.1**order], np.poly([0.9] * order), np.roll(u, 1))
+    noise = 1e-3 * y.std() * rng.normal(size=600)
+    pd.DataFrame({"u": u, "y": y + noise}).to_csv(tmp_path / "run.csv", index=False)
+    options = ("--inputs", "u", "--outputs", "y", "--out", tmp_path / "spec.toml")
+    said = " ".join(run("init", tmp_path / "run.csv", *options).out.split())
+    one_step = re.search(r"its error in free run is ([\d.]+) %", said)
+    whole = re.search(r"fitted to the free run, .*? its error is ([\d.]+) %", said)
+    assert one_step is not None and (whole is None) == (order == 1), said
+    if whole is not None:
+        assert float(whole[1]) < 0.7 * float(one_step[1])
+
+
 def test_a_time_that_begins_anew_separates_experiments(tmp_path):
     u, y = plant(300)
     time = np.concatenate([0.5 * np.arange(120), 0.5 * np.arange(180)])

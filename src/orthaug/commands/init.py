@@ -557,6 +557,13 @@ def _account(
         else f"first physics: {physics}; its error {horizon} is {shown} of the output's standard "
         f"deviation on {where}"
     )
+    own = model.free_run if roles.inputs and model.restarted is None else ()
+    if own and max(own) < _CLEARLY_LESS * max(errors):
+        shown = ", ".join(percent(error, 3) for error in own)
+        lines.append(
+            f"fitted to the free run, as `orthaug fit` does where that is better, its error "
+            f"is {shown} on the last {percent(1 - FITTED)} of rows 0 to {cut}"
+        )
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
