@@ -1112,6 +1112,26 @@ def test_the_error_after_a_fit_of_the_free_run_is_stated_where_it_is_clearly_les
         assert float(whole[1]) < 0.7 * float(one_step[1])
 
 
+@pytest.mark.parametrize("order", ["rising", "falling", "shuffled"])
+def test_a_static_characteristic_is_called_one(tmp_path, order):
+    """Speeds over pulse widths, in the order of these."""
+    rng = np.random.default_rng(3)
+    pulse = np.sort(np.round(rng.uniform(1000, 2000, 300)))
+    pulse = {"rising": pulse, "falling": pulse[::-1], "shuffled": rng.permutation(pulse)}[order]
+    speed = 50 * np.tanh((1450 - pulse) / 200) + 0.5 * rng.normal(size=300)
+    pd.DataFrame({"pulse": pulse, "speed": speed}).to_csv(tmp_path / "run.csv", index=False)
+    options = ("--inputs", "pulse", "--outputs", "speed", "--out", tmp_path / "spec.toml")
+    done = run("init", tmp_path / "run.csv", *options)
+    assert done.code == 0, done.err
+    said = " ".join(done.out.split())
+    if order == "shuffled":
+        assert "pulse excites up to order 20" in said and "from row to row" not in said
+    else:
+        way = "rises" if order == "rising" else "falls"
+        assert f"pulse only {way} from row to row" in said
+        assert "static relation" in said and "excites" not in said
+
+
 def test_a_time_that_begins_anew_separates_experiments(tmp_path):
     u, y = plant(300)
     time = np.concatenate([0.5 * np.arange(120), 0.5 * np.arange(180)])

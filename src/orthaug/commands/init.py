@@ -502,7 +502,13 @@ def _account(
     for column, delay, order, unsure in zip(
         roles.inputs, model.delays, model.persistence, model.undetermined, strict=True
     ):
-        lines.append(f"{column.name} excites {_order(order)}; {_delay(delay, unsure, order)}")
+        excites = f"excites {_order(order)}; {_delay(delay, unsure, order)}"
+        if column.one_way:
+            excites = (
+                f"only {column.one_way} from row to row: such rows show a static relation, and "
+                "hardly how it settles. For a static one write terms of lag 0, without past outputs"
+            )
+        lines.append(f"{column.name} {excites}")
     if roles.every > 1:
         lines.append(
             f"one row in {roles.every} has a value of every output: these rows are used. A "

@@ -33,6 +33,7 @@ _MEASURED = re.compile(
 _HELD = 6  # rows at the largest or smallest value from which on it is suspected to be a limit
 _OFTEN = 5.0  # times the rows that a value usually has
 _LONGER = 3.0  # times the rows for which other values are usually held
+_SWEPT = 0.5  # of the rows, in which a signal moves that runs through its range once
 _LEVELS = 20  # of a signal at least, for one with fewer is often at its extremes anyway
 _FINEST = 1e5  # steps within the range from which on rounding of the numbers could make them
 _RANGE = 100.0  # steps within the range from which on a signal that turns looks rounded
@@ -88,6 +89,14 @@ class Column:
     def switched(self) -> bool:
         """True if it is switched between a few levels: their distance is no resolution."""
         return len(np.unique(self.finite)) <= _LEVELS
+
+    @property
+    def one_way(self) -> str:
+        """Direction of a signal that runs through its range once, "rises" or "falls"; else ""."""
+        steps = np.diff(self.finite)
+        if np.count_nonzero(steps) < max(_SWEPT * len(steps), 1) or (steps.min() < 0 < steps.max()):
+            return ""
+        return "rises" if steps.sum() > 0 else "falls"
 
     @property
     def limits(self) -> tuple[tuple[float, int], ...]:
