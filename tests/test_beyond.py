@@ -270,4 +270,5 @@ def test_an_integrator_is_no_proof_of_a_bounded_run(radius: float) -> None:
     text = describe_beyond(model, radius)
     assert "integrates there" in text and "proof" not in text
     assert "This is a proof" in describe_beyond(model, 0.99)
+    assert "just below 1 there" in describe_beyond(model, 0.99998)
     assert "proves no bound" in describe_beyond(model, 1.01)

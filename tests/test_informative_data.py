@@ -98,3 +98,27 @@ def test_a_record_at_rest_explains_nothing_and_one_that_moves_is_not_called_that
     moved = 5 + np.repeat(np.random.default_rng(2).uniform(-1, 1, 30), 40)
     assert "explains_nothing" not in rest(moved, 0.002)
     assert "sign and the unit of every input" in rest(moved - 5, 0.0005, -1.0)["explains_nothing"]
+
+
+@pytest.mark.parametrize("segment", [0, 50])
+def test_shorter_runs_are_advised_where_physics_that_lacks_something_integrates(segment):
+    """A loop holds a cart on a slope: what its weight adds is integrated twice."""
+    rng = np.random.default_rng(4)
+    wanted, x, v, force, y = np.repeat(rng.normal(size=40), 10), 0.0, 0.0, [], []
+    for place in wanted:
+        force.append(0.8 + 4 * (place - x) - 3 * v + 0.2 * rng.normal())
+        y.append(x)
+        for _ in range(10):
+            x, v = x + 0.01 * v, v + 0.01 * (force[-1] - 0.8)
+    record = oa.Record.from_arrays(
+        np.array(force), np.array(y), sampling_time=0.1, inputs=["force"], outputs=["place"]
+    )
+    motion = oa.Motion.from_equations(
+        states=[oa.State("x", "v", start="place"), oa.State("v", "g*force")],
+        outputs=[oa.Output("place", "x")],
+        inputs=["force"],
+        parameters=[oa.PhysicalParameter("g", 0.5)],
+    )
+    fit = oa.estimate(record, motion, learner=None, criterion=oa.Simulation(segment=segment))
+    texts = {one.code: one.text for one in fit.diagnose().warnings}
+    assert ("`segment` = 50" in texts.get("explains_nothing", "")) == (not segment)

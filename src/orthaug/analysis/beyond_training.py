@@ -76,7 +76,9 @@ def describe_beyond(model: Model, radius: float | None) -> str:
             f"{opening}The physics alone integrates there: under an input that does not average to "
             "zero the free run grows without bound."
         )
-    text = f"{opening}The physics alone has a spectral radius of {radius:.4g} there"
+    size = f"{radius:.4g}"
+    near = f"just {'below' if radius < 1 else 'above'} 1" if float(size) == 1 else size
+    text = f"{opening}The physics alone has a spectral radius of {near} there"
     if radius < 1:
         return f"{text}: bounded inputs give a bounded free run. This is a proof, not a sample."
     return f"{text}, so that proves no bound of the free run there."

@@ -119,7 +119,15 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
             residuals.verdict == "unmodelled"
             or any(one.own_past > _NO_NOISE for one in residuals.predictable)
         )
-        judged = partial(explains_nothing, part=evidence.train, parameters=estimated, driven=driven)
+        alone_model = fit.model if physics is None else physics.model
+        judged = partial(
+            explains_nothing,
+            part=evidence.train,
+            parameters=estimated,
+            driven=driven,
+            physics=alone_model,
+            steps=fit.criterion.free_run.steps,
+        )
         other = from_trained_start(fit, run) if judged(run) else None
         warnings += judged(run if other is None else other[0].response)
         warnings += attempt(

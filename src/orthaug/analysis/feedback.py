@@ -32,6 +32,8 @@ _BATCH = 1024  # rows per compiled call
 _WIDTH = 1e-3  # of differences, in deviations: bears a learner in single precision
 MOST_WORK = 4e7  # rows times n0³
 _LONGEST_STATE = 200  # n0 with eigenvalues at all
+_FEW_POINTS = 50  # of a run, at which its modes are looked at
+_FORGOTTEN = 0.1  # share of a start that an integrator loses over the record, at most
 
 
 def linearise_points(
@@ -42,6 +44,18 @@ def linearise_points(
     finite = (np.abs(transition) < _NO_DERIVATIVE).all(axis=(1, 2))
     radius = np.abs(np.linalg.eigvals(transition[finite])).max(axis=1, initial=0.0)
     return visited.take(finite), transition[finite], radius
+
+
+def integrates(model: Model, record: Record) -> bool:
+    """Return whether a mode of the free run forgets hardly anything over the record."""
+    if not 0 < model.form.states <= _LONGEST_STATE:
+        return False
+    run = sample_free_run(model, record, model.simulate(record), _FEW_POINTS)
+    points, transition, _ = linearise_points(model, run.points)
+    if not len(points):
+        return False
+    nearest = np.abs(np.linalg.eigvals(transition) - 1).min(axis=1)
+    return bool((nearest * len(record) < _FORGOTTEN).all())
 
 
 def transitions(

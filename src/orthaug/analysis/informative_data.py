@@ -16,8 +16,10 @@ import numpy as np
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
 from orthaug._base.lines import join_words
+from orthaug.analysis.feedback import integrates
 from orthaug.data.part import Part
 from orthaug.data.record import Record
+from orthaug.models.model import Model
 from orthaug.models.response import Response
 
 _FEWEST = 64  # rows of an experiment whose frequencies are counted
@@ -27,6 +29,8 @@ _LISTED = 4
 # Of an output's variance: what a free run explains of noise by its best frequency, in units of
 # log N / N
 _BY_CHANCE = 4.0
+# Runs that the rows are cut into where what an integrator lacks adds up, and steps of one at least
+_PIECES, _SHORTEST = 10, 50
 
 
 def few_frequencies(record: Record, parameters: int) -> tuple[Warning, ...]:
@@ -102,7 +106,13 @@ def _lines(signal: Vector, step: float, most: int) -> list[float] | None:
 
 
 def explains_nothing(
-    free_run: Response, part: Part, parameters: int, *, driven: bool
+    free_run: Response,
+    part: Part,
+    parameters: int,
+    *,
+    driven: bool,
+    physics: Model,
+    steps: int,
 ) -> tuple[Warning, ...]:
     """Return a warning where a free run explains no more of an output than of noise.
 
@@ -111,6 +121,8 @@ def explains_nothing(
         part: the training data.
         parameters: number of those that are estimated.
         driven: whether the error is more than noise: then the outputs move, but otherwise.
+        physics: without a learner. Where it integrates, shorter runs are advised.
+        steps: of a run in training; 0 for whole experiments.
     """
     if any(run.diverged for run in free_run.trajectories):
         return ()
@@ -136,6 +148,13 @@ def explains_nothing(
         else "The parameters are those of the noise, but for what the mean determines, and their "
         f"intervals mean nothing. Give data {wanted}."
     )
+    segment = max(rows // _PIECES, _SHORTEST)
+    longer = not 0 < steps <= segment
+    if driven and longer and integrates(physics, part.record):
+        meant += (
+            " The physics integrates: what it lacks adds up over the record and hides the rest. "
+            f"Train on shorter runs (`segment` = {segment} in [training])."
+        )
     text = (
         f"the free run explains no more of {join_words(none)} than it would of noise by chance. "
         f"{meant}"
