@@ -120,13 +120,14 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
             or any(one.own_past > _NO_NOISE for one in residuals.predictable)
         )
         alone_model = fit.model if physics is None else physics.model
+        trained = fit.criterion.free_run
         judged = partial(
             explains_nothing,
             part=evidence.train,
             parameters=estimated,
             driven=driven,
             physics=alone_model,
-            steps=fit.criterion.free_run.steps,
+            steps=None if trained is None else trained.steps,
         )
         other = from_trained_start(fit, run) if judged(run) else None
         warnings += judged(run if other is None else other[0].response)

@@ -112,7 +112,7 @@ def explains_nothing(
     *,
     driven: bool,
     physics: Model,
-    steps: int,
+    steps: int | None,
 ) -> tuple[Warning, ...]:
     """Return a warning where a free run explains no more of an output than of noise.
 
@@ -122,7 +122,7 @@ def explains_nothing(
         parameters: number of those that are estimated.
         driven: whether the error is more than noise: then the outputs move, but otherwise.
         physics: without a learner. Where it integrates, shorter runs are advised.
-        steps: of a run in training; 0 for whole experiments.
+        steps: of a run in training; 0 for whole experiments, None where rows were trained on.
     """
     if any(run.diverged for run in free_run.trajectories):
         return ()
@@ -149,7 +149,7 @@ def explains_nothing(
         f"intervals mean nothing. Give data {wanted}."
     )
     segment = max(rows // _PIECES, _SHORTEST)
-    longer = not 0 < steps <= segment
+    longer = steps is not None and not 0 < steps <= segment
     if driven and longer and integrates(physics, part.record):
         meant += (
             " The physics integrates: what it lacks adds up over the record and hides the rest. "
