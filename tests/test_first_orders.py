@@ -7,7 +7,7 @@ import random
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 
 from orthaug import Record
 from orthaug.selection.first_orders import first_model, first_significant_lag
@@ -157,6 +157,17 @@ def test_a_lag_before_which_others_act_is_no_dead_time(seed):
     model = first_model(crane(seed))
     assert model is not None and model.orders.nk[0] <= 1
     assert (model.delays, model.undetermined) == ((None,), (True,))
+
+
+@pytest.mark.parametrize("acts", [True, False])
+def test_lags_that_act_together_alone_are_not_called_insignificant(acts):
+    """Neighbouring lags of a smooth input replace each other in a filter of high order."""
+    rng = np.random.default_rng(1)
+    u, other = (lfilter(*butter(3, 0.4), rng.normal(size=300)) for _ in range(2))
+    y = lfilter(*butter(4, 0.1), u if acts else other)
+    record = Record.from_arrays(u, y + 0.01 * y.std() * rng.normal(size=300))
+    model = first_model(record)
+    assert model is not None and (model.delays, model.undetermined) == ((None,), (acts,))
 
 
 @pytest.mark.parametrize("delay", [2, 3, 5, 10])

@@ -252,7 +252,8 @@ def test_a_sensor_at_its_limit_is_not_frozen(tmp_path):
     y = scipy.signal.lfilter([0, 0.1], [1, -0.9], u) + 0.002 * rng.normal(size=400)
     limited = np.minimum(y, np.percentile(y, 94))
     frozen = np.where(np.abs(np.arange(400) - 115) < 15, y.max() + 0.5, y)
-    for cells, is_frozen in ((limited, False), (frozen, True)):
+    steep = np.minimum(np.exp(4 * y), np.exp(4 * np.percentile(y, 94)))
+    for cells, is_frozen in ((limited, False), (steep, False), (frozen, True)):
         table = np.column_stack([u, cells])
         np.savetxt(tmp_path / "run.csv", table, delimiter=",", header="u,y", comments="")
         found = {warning["code"] for warning in told(tmp_path, SPEC)["warnings"]}

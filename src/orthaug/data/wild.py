@@ -38,7 +38,8 @@ _NAMED = 3
 _FEWEST = 20  # samples of a channel
 _FROZEN, _FROZEN_SHARE = 20, 0.02  # rows for which a frozen sensor does not move, at least
 _STILL = 0.02  # share of equal neighbours elsewhere, at most
-_GRADUAL = 3.0  # RMS of an output's steps, up to which it comes to a limit and leaves it
+# Times an output's usual step, or those beside, up to which it comes to a limit and leaves it
+_GRADUAL, _BESIDE = 3.0, 4
 _REPEATS = 2  # single rows that repeat the one before, at least
 _MOVING = 0.01  # of the deviation of its steps: by less an output rests
 _BY_CHANCE = 0.2  # of their number: more of them are expected of an output in coarse steps
@@ -396,10 +397,15 @@ def _ends_at_limit(y: Vector, begin: int, rows: int) -> bool:
 
     A limit of sensor or plant, which `saturated_output` is about; what freezes jumps at its end.
     """
-    steps = np.diff(y)
-    around = [steps[row] for row in (begin - 1, begin + rows) if 0 <= row < len(steps)]
-    usual = _GRADUAL * float(np.sqrt(np.mean(steps[steps != 0] ** 2)))
-    return bool(y[begin] in (y.min(), y.max()) and np.all(np.abs(around) <= usual))
+    if y[begin] not in (y.min(), y.max()):
+        return False
+    steps = np.abs(np.diff(y))
+    usual = float(np.sqrt(np.mean(steps[steps > 0] ** 2)))
+    before, after = steps[:begin][::-1], steps[begin + rows :]
+    return all(
+        not len(side) or side[0] <= _GRADUAL * max(usual, side[1:_BESIDE].max(initial=0.0))
+        for side in (before, after)
+    )
 
 
 def _longest_stretch(same: np.ndarray) -> tuple[int, int]:

@@ -378,8 +378,9 @@ def first_significant_lag(record: Record, number: int) -> int | None:
     """Return the first lag of an input with an effect beside past outputs and all other lags.
 
     Where rows or excitation do not allow that, by the cross-correlation with the input made white;
-    where none is significant, by that of the input's square. None where lags before it act, too,
-    but none of them by itself, as those of a smooth input: then the data do not determine it.
+    where none is significant, by that of the input's square. None where lags before it act, too, or
+    only all of them together, none by itself, as those of a smooth input: then the data do not
+    determine it.
     """
     return _first_lag(_spread_windows(record), number)[0]
 
@@ -398,6 +399,7 @@ def _first_lag(record: Record, number: int) -> tuple[int | None, bool]:
         found.append(correlated_delay(own, number, most) if tested is None else tested)
         if found[-1] is None:  # an even function of an input has no linear correlation with it
             found[-1] = correlated_delay(own, number, most, squared=True)
+            undetermined |= found[-1] is None and _earlier_lags_act(own, number, most, most + 1)
         elif _earlier_lags_act(own, number, most, found[-1]):
             found[-1], undetermined = None, True
     seen = [lag for lag in found if lag is not None]
