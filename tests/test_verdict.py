@@ -250,6 +250,19 @@ def test_the_verdict_on_trials(trials, code):
     assert content["verdict"] == code and len(content["trials"]) == len(trials)
 
 
+@pytest.mark.parametrize(("lost", "opening"), [(20, "It is undecided whether the"), (200, "The")])
+def test_a_learner_that_loses_in_one_stretch_alone_may_still_help(lost, opening):
+    """On average it is worse, but an interval from a half on does not say that it does not help."""
+    rng = np.random.default_rng(0)
+    alone = rng.uniform(0.5, 1.5, 200)
+    model = np.where(np.arange(200) < lost, 11.0 if lost < 200 else 1.01, 0.2) * alone
+    errors = [math.sqrt(piece.mean()) for piece in (alone, model)]
+    found = judge([Trial("tests.a", *errors, pieces=([alone], [model]))])
+    assert found.code == "no_help" and found.ratio.value > 1
+    assert found.text.startswith(f"{opening} learner ")
+    assert (found.ratio.low < 0.8) == (lost < 200)
+
+
 def test_a_wide_interval_below_one_is_undecided():
     """A part where most of the gain is in one stretch: on average much better, yet not surely."""
     rng = np.random.default_rng(0)

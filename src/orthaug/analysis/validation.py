@@ -32,8 +32,9 @@ from orthaug.models.response import Response
 _BEYOND, _FAR = (0.01, 0.1)
 _OFTEN = 0.01  # of the rows: a smaller excursion counts from there on
 _MUCH = 0.1  # of a part's rows outside: what is wrong there may be that
-# Ratio of errors below which an interval that holds 1 leaves undecided what is not shown
-_LIKELY = 0.9
+# Ratio of errors below which an interval that holds 1 leaves undecided what is not shown, and lower
+# end of such an interval from which on a gain that matters is not excluded
+_LIKELY, _NOT_EXCLUDED = 0.9, 0.8
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,7 @@ def _no_help(ratio: Ratio) -> str:
     """Return the opening of a verdict on a learner that does not help, or not by much."""
     if ratio.low < ratio.high < 1:
         return "The learner lowers the free run's error surely, but by little"
-    if ratio.value < _LIKELY and ratio.high > 1:
+    if ratio.high > 1 and (ratio.value < _LIKELY or ratio.low < _NOT_EXCLUDED):
         return "It is undecided whether the learner helps"
     return "The learner does not help"
 
