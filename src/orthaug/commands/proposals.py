@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from orthaug.fitting.estimates import Estimate
 
 _OTHER_NOISE = (
-    "It was not tried, because it moves the parameters and their intervals more than the free run."
+    "It was not tried: it mends the parameters and their intervals, and its free run may be worse."
 )
 _OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 _OTHER_UNIT = "It was not tried, because errors in another unit cannot be compared."
