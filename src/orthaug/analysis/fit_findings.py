@@ -91,6 +91,11 @@ class ParameterResult(Content):
         """Unit of the spec, or in brackets the one that follows from those of the channels."""
         return self.unit or (f"({self.derived_unit})" if self.derived_unit else "–")
 
+    @property
+    def errors_of_bias(self) -> float:
+        """The size of its bias in standard errors."""
+        return abs(self.bias.value or 0.0) / self.std if self.bias and self.std else 0.0
+
     def with_bias(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
         """Return the parameter with its bias, and with whether the learner could imitate it."""
         found: dict[str, object] = {"shared": shared}

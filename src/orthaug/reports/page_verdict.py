@@ -370,18 +370,13 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
 
 def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
     """Return the size of the largest bias: of the value, and in standard errors."""
-    worst = max(rows, key=_errors_of)
+    worst = max(rows, key=lambda row: row.errors_of_bias)
     if worst.bias is None or worst.bias.value is None:
         return ""
-    times = f"{plain_number(_errors_of(worst))} times its standard error"
+    times = f"{plain_number(worst.errors_of_bias)} times its standard error"
     share = percent(worst.bias.value / worst.value, signed=True) if worst.value else ""
     size = f"{share}, {times}" if share else times
     return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
-
-
-def _errors_of(row: ParameterResult) -> float:
-    """Return the size of its bias in standard errors."""
-    return abs(row.bias.value or 0.0) / row.std if row.bias and row.std else 0.0
 
 
 def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
@@ -480,9 +475,9 @@ def _use_text(result: FitResult, level: str) -> str:
         else:
             text += imitable.doubt
     if bare:
-        several = len(bare) > 1
-        text += f". {join_words(bare)} {'have no intervals' if several else 'has no interval'}"
-        text += f", which would say how close to physics {'they are' if several else 'it is'}"
+        one = ("has no interval", "it is"), ("have no intervals", "they are")
+        has, they = one[len(bare) > 1]
+        text += f". {join_words(bare)} {has}, which would say how close to physics {they}"
     text += (
         f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
         "physics"
