@@ -363,9 +363,8 @@ class MotionSection(KindSection):
         """Raise ValueError for a noise model that a spec cannot have, which was `found`."""
         if spec.noise.model == "arma" or spec.noise.model_fields_set - {"model"}:
             what = "" if spec.noise.model == "arma" else "; `ar`, `ma` and `largest` are of `arma`"
-            raise ValueError(
-                f"{found} beside [motion] or `learner.states`{what}: `noise.model` = arma {OF_LAGGED}"
-            )
+            beside = f"{found} beside [motion] or `learner.states`{what}"
+            raise ValueError(f"{beside}: `noise.model` = arma {OF_LAGGED}")
         if spec.controller is not None:
             raise ValueError(
                 f"{found} beside [controller]; expected white, or no controller: the predictor "

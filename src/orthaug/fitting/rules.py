@@ -169,14 +169,14 @@ def check_motion_choices(
             "a motion is trained on its free run; take `Simulation(…)`: its states are not "
             "measured, so there is no error one step ahead.",
             "focus",
-            " = prediction; expected simulation: states, of a motion or of a learner, are not measured",
+            " = prediction; expected simulation: states of a motion or learner are not measured",
         )
     if not structure.projects:
         raise KeyedError(
             "a motion has the orthogonal structure: its parameters are the nearest physics; "
             f"got {structure.name}.",
             "kind",
-            f" = {structure.name}; expected orthogonal for a motion, and beside learner.states",
+            f" = {structure.name}; expected orthogonal for a motion or beside learner.states",
         )
     if not solver.gauss_newton:
         raise KeyedError(
