@@ -135,6 +135,22 @@ class Expression:
         """Return its value for `values` of its names; of an expression without channels."""
         return _evaluate(self.tree, {}, values, xp, self.text)
 
+    @cached_property
+    def is_partial(self) -> bool:
+        """True if it has no value for some numbers: a root, a logarithm, a power with a fraction.
+
+        Division by zero is left out, for it is met at single points only.
+        """
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("sqrt", "log"):
+                return True
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
+                power = node.right.operand if isinstance(node.right, ast.UnaryOp) else node.right
+                whole = isinstance(power, ast.Constant) and float(power.value).is_integer()  # type: ignore[arg-type]
+                if not whole:
+                    return True
+        return False
+
     def term_without_value(self, values: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
         """Return the smallest term that is not finite although all in it is, and its names."""
 
