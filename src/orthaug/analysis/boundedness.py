@@ -60,8 +60,9 @@ def find_divergence(model: Model, record: Record, largest: float = 1024.0) -> Di
         InputError: as `divergence_scaling`.
     """
     found = _find_confirmed(model, record, largest)
-    physics: Any = getattr(model.form, "motion", None) or model.form.baseline
-    if found.factor is None or not any(one.is_partial for one in physics.expressions):
+    physics = getattr(model.form, "motion", None) or getattr(model.form, "baseline", None)
+    expressions = getattr(physics, "expressions", ())  # none of a form from elsewhere
+    if found.factor is None or not any(one.is_partial for one in expressions):
         return found
     fine = _with_substeps(model, found.finer) if found.finer else model
     _, undefined = _run_scaled(fine, _first_rows(fine, record), [found.factor])
