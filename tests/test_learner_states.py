@@ -106,8 +106,9 @@ def test_its_free_run_is_as_good_as_that_of_the_true_equations(fit, measured):
 def test_physics_alone_has_no_state_of_the_learner(fit, measured):
     alone = fit.physics_alone
     assert alone.model.state_names == ("x", "v")
-    plain = oa.estimate(measured[0], spring(), learner=None, standard_errors="plain")
+    plain = oa.estimate(measured[0], spring(), learner=None)
     np.testing.assert_allclose(alone.values, plain.values, rtol=1e-5)
+    assert alone.std_kind == plain.std_kind == "batch-means"
     np.testing.assert_allclose(alone.std, plain.std, rtol=1e-3)
 
 

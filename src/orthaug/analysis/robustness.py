@@ -40,11 +40,13 @@ _MEMORIES = 3  # times as many lags as the residual's correlation lasts: Bartlet
 def with_suited_errors(fit: Estimate, *, ordered: bool = True) -> Estimate:
     """Return a fit of rows in memory with the standard errors that suit its errors.
 
-    As `robust_where_asked`; the fit as it is where that fails.
+    As `robust_where_asked`; the fit as it is where that fails. Likewise for physics alone.
 
     Args:
         ordered: whether the order of the rows means something, so that errors have a colour.
     """
+    if fit.physics_alone is not None:
+        fit = replace(fit, physics_alone=with_suited_errors(fit.physics_alone, ordered=ordered))
     if isinstance(fit.problem, StreamedProblem) or not fit.status.ok or not fit.robust_kinds:
         return fit
     return attempt("the robust covariance", lambda: _suited(fit, ordered=ordered), [], fit)
