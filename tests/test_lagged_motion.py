@@ -73,13 +73,12 @@ def test_states_are_the_lags():
     found = motion_of_lags(oa.Baseline.from_terms(terms), Lags(1, 1, 2), None, ["y"], ["u"])
     states = {state.name: (state.derivative, state.start) for state in found.motion.states}
     assert states == {
-        "y": ("a1*y + a2*y_1 + b*u + d*(u_2 * abs(y_1)) + known*(1.0)", "y"),
+        "y": ("a1*y + a2*y_1 + b*u + d*(u_2 * abs(y_1)) + 0.5*(1.0)", "y"),
         "y_1": ("y", "y"),
         "u_1": ("u", None),
         "u_2": ("u_1", None),
     }
     assert [state.name for state in found.motion.states if state.learned] == ["y"]
-    assert dict(found.motion.constants) == {"known": 0.5}
     assert found.motion.parameters[2].min == 0 and found.learner_inputs == ("y", "u_1")
     assert found.named("y[k-2] - u[k-2]") == "y_1 - u_1"
 
@@ -97,6 +96,42 @@ def test_physical_parameters_stay_parameters_and_theta_becomes_definitions():
     motion = motion_of_lags(baseline, None, None, ["y"], ["u"], physics=physics).motion
     assert motion.parameters == (mass,)
     assert [(name, str(text)) for name, text in motion.definitions] == [("g", "Ts/m")]
+
+
+def test_theta_that_is_a_physical_parameter_itself_is_no_definition():
+    own = [PhysicalParameter("a", 0.5), PhysicalParameter("m", 2.0, min=0)]
+    physics = PhysicsMap.of(own, {"a": "a", "m_": "a/m"}, {})
+    baseline = oa.Baseline.from_terms([oa.Term("a", "y[k-1]"), oa.Term("m_", "u[k-1]")])
+    motion = motion_of_lags(baseline, None, None, ["y"], ["u"], physics=physics).motion
+    assert motion.names == ("a", "m") and [name for name, _ in motion.definitions] == ["m_"]
+    with pytest.raises(oa.InputError, match="gives no 'a'"):
+        wrong = PhysicsMap.of(own[1:], {"m_": "1/m"}, {})
+        motion_of_lags(baseline, None, None, ["y"], ["u"], physics=wrong)
+
+
+def test_two_outputs_have_terms_of_their_own():
+    terms = [oa.Term("a", "y1[k-1]", output="y1"), oa.Term("b", "y1[k-1]", output="y2")]
+    found = motion_of_lags(oa.Baseline.from_terms(terms), None, None, ["y1", "y2"], [])
+    assert [state.derivative for state in found.motion.states] == ["a*y1", "b*y1"]
+    unnamed = oa.Baseline.from_terms([oa.Term("a", "y1[k-1]"), *terms[1:]])
+    with pytest.raises(oa.InputError, match="`output` is missing"):
+        motion_of_lags(unnamed, None, None, ["y1", "y2"], [])
+
+
+def test_many_terms_are_a_sum_of_sums():
+    terms = [oa.Term(f"parameter_{i}", f"sin({i + 1}*y[k-1])*u[k-1]") for i in range(30)]
+    motion = motion_of_lags(oa.Baseline.from_terms(terms), None, None, ["y"], ["u"]).motion
+    assert motion.states[0].derivative.startswith("y_part1 + y_part2")
+    assert motion.names == tuple(term.parameter for term in terms)
+
+
+def test_what_a_motion_cannot_be_is_refused_in_words():
+    deep = oa.Baseline.from_terms([oa.Term("b", "u[k-3000]")])
+    with pytest.raises(oa.InputError, match="at most 64 are possible"):
+        motion_of_lags(deep, None, None, ["y"], ["u"])
+    clash = oa.Baseline.from_terms([oa.Term("u", "u[k-1]")])
+    with pytest.raises(oa.InputError, match="is written as a motion"):
+        motion_of_lags(clash, None, None, ["y"], ["u"])
 
 
 def test_its_free_run_is_that_of_the_lagged_model():
@@ -133,6 +168,15 @@ def test_a_spec_with_a_learner_that_remembers_is_one_of_a_motion(tmp_path):
     assert spec.learner_inputs() == ("y", "y_1", "u", "u_1")
     assert spec.suspects[0].on == "y - y_1" and spec.suspects[0].equation == "y"
     assert spec.declared_motion().states[0].derivative == "a1*y + a2*y_1 + b*(gain * u)"
+    assert spec.moved_lags
+    path.write_text(SPEC.replace("hidden = [4]", 'kind = "none"'))
+    assert load_spec(path).motion is None  # keys of another kind have no effect
+    path.write_text(SPEC.replace('output = "y"', 'output = "y"\nequation = "y"'))
+    done = run("check", path)
+    assert done.code == 2 and "suspects[0].equation" in " ".join(done.err.split())
+    path.write_text(SPEC.replace("[[suspects]]", "[suspects]"))
+    done = run("check", path)
+    assert done.code == 2 and "'suspects'" in " ".join(done.err.split())
     path.write_text(SPEC.replace("u[k-1]", "u[k]"))
     spec = load_spec(path)
     assert spec.declared_motion().states[0].derivative == "a1*y + a2*y_1 + b*(gain * u)"
@@ -153,12 +197,17 @@ def test_a_brake_that_lags_is_learned_to_the_noise():
     assert abs(fit.values[2] - 0.2) < 4 * fit.std[2]
 
 
-def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(tmp_path):
+@pytest.mark.parametrize("present", [False, True])
+def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(tmp_path, present):
     record = plant(900)
-    rows = zip(record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0], strict=True)
+    u, y = record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0]
+    if present:
+        u, y = u[:-1], y[1:]
+    rows = zip(u, y, strict=True)
     (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
-    path = tmp_path / "spec.toml"
-    path.write_text(SPEC.replace("states = 1\n", ""))
+    path, spec = tmp_path / "spec.toml", SPEC.replace("states = 1\n", "")
+    spec = spec.replace("u[k-1]", "u[k]").replace("nb = 2", "nb = 2\nnk = 0") if present else spec
+    path.write_text(spec)
     done = run("fit", path, "--out", tmp_path / "result")
     assert done.code == 0
     result = json.loads((tmp_path / "result" / "result.json").read_text())

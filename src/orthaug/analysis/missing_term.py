@@ -69,7 +69,7 @@ def may_be_missing(p: float | None, share: float | None) -> bool:
         p: that nothing is missing.
         share: of the errors' variance that the terms explain together.
     """
-    return (p or 0.0) < _DOUBTFUL and (share or 0.0) > _NAMED
+    return p is not None and p < _DOUBTFUL and (share or 0.0) > _NAMED
 
 
 @dataclass(frozen=True)

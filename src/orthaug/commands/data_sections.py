@@ -342,8 +342,8 @@ class MotionSection(KindSection):
             self._check_missing(spec)
         if spec.training.ensemble:
             raise ValueError(
-                "`training.ensemble`: a motion has none, because medians of runs follow no "
-                "equations"
+                "`training.ensemble`: a motion, or a learner with `states`, has none, because "
+                "medians of runs follow no equations"
             )
 
     def _check_missing(self, spec: Any) -> None:

@@ -72,6 +72,11 @@ class Variant:
         return replace(self, fold=fold)
 
 
+_LAGS_AS_MOTION = (
+    "the learner has states of its own, so the lagged physics is fitted on its free run, as the "
+    "discrete motion of its lags: y_1 is y[k-1]. `spec` in result.json has that motion; advised "
+    "changes are changes of it."
+)
 MISSING_STATE = "the missing state"  # what a change that adds one begins with
 AS_DECLARED = Variant()
 
@@ -352,7 +357,8 @@ class Job:
             record = self.train.record
             names = [channel.name for channel in record.channels]
             of_parts = of_free_run(of_parts, record.prepared, names)
-        return (*of_parts, *self._of_samples, *self.left_out)
+        moved = (Warning("lags_as_motion", _LAGS_AS_MOTION),) if self.spec.moved_lags else ()
+        return (*of_parts, *self._of_samples, *self.left_out, *moved)
 
     @cached_property
     def _of_samples(self) -> tuple[Warning, ...]:

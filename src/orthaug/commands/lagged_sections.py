@@ -14,10 +14,11 @@ from orthaug.data.expressions import SAMPLING_TIME
 from orthaug.data.regressors import Lags
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.noise import OF_MOTIONS
+from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_lags
 from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.lagged_motion import motion_of_lags
+from orthaug.physics.lagged_motion import LaggedMotion, motion_of_lags
 from orthaug.physics.parameters import PhysicsMap
 
 Orders = Count | list[Count]
@@ -136,20 +137,27 @@ class PhysicsSection(Section):
 def with_lags_in_motion(content: Any) -> Any:
     """Return the content of a spec, with a motion for lagged physics beside a learner with states.
 
-    What reads lags, the learner's inputs and suspects, reads the motion's states then. An input
-    with a present sample, u[k], comes a row earlier by a step of preparation. Sections that cannot
-    be read stay, for their own checks to name the fault.
+    What reads lags, the learner's inputs, suspects and the box of a measure, reads the motion's
+    states then. An input with a present sample, u[k], comes a row earlier by a step of preparation.
+    Sections that cannot be read stay, for their own checks to name the fault.
 
     Raises:
         InputError: physics that no motion can be.
+        ValueError: keys that such physics does not have.
     """
     learner = content.get("learner") if isinstance(content, Mapping) else None
-    if not isinstance(learner, Mapping) or not learner.get("states"):
+    if not isinstance(learner, Mapping) or not _remembers(learner):
         return content
     if "motion" in content or "baseline" not in content:
         return content
-    data: Any = content.get("data")
-    suspects = content.get("suspects", [])
+    data, suspects = content.get("data"), content.get("suspects", [])
+    if not isinstance(data, Mapping) or not isinstance(suspects, list):
+        return content
+    lists = data.get("outputs"), data.get("inputs", []), learner.get("inputs", [])
+    steps = data.get("prepare", [])
+    tables = all(isinstance(one, Mapping) for one in suspects) and isinstance(steps, list)
+    if not tables or not all(_is_list_of_text(one) for one in lists):
+        return content
     try:
         baseline = BaselineSection.model_validate(content["baseline"]).declared
         lags = LagsSection.model_validate(content["lags"]).declared if "lags" in content else None
@@ -157,25 +165,53 @@ def with_lags_in_motion(content: Any) -> Any:
         if "physics" in content:
             section = PhysicsSection.model_validate(content["physics"])
             physics = section.declared({SAMPLING_TIME: 1.0} | dict(baseline.constants))
-        read = [suspect["on"] for suspect in suspects if "on" in suspect]
-        channels = data["outputs"], data.get("inputs", [])
-    except (KeyError, TypeError, AttributeError, ValidationError):
+            if section.profile:
+                raise ValueError(
+                    "`physics.profile`: found true beside `learner.states`; expected false, for "
+                    "the motion that is fitted then has no profile"
+                )
+    except ValidationError:
         return content
+    for i, suspect in enumerate(suspects):
+        for key in sorted(suspect.keys() & BaselineSection.foreign_keys.keys()):
+            raise ValueError(f"`suspects[{i}].{key}`: found {BaselineSection.foreign_keys[key]}")
     found = motion_of_lags(
-        baseline, lags, learner.get("inputs"), *channels, physics=physics, further=read
+        baseline,
+        lags,
+        learner.get("inputs"),
+        data["outputs"],
+        data.get("inputs", []),
+        physics=physics,
+        further=[suspect["on"] for suspect in suspects if "on" in suspect],
     )
-    places = {"output": "equation"}
-    moved = [
-        {
-            places.get(key, key): found.named(value) if key == "on" else value
-            for key, value in suspect.items()
-        }
-        for suspect in suspects
-    ]
     kept = {name: own for name, own in content.items() if name not in _LAGGED}
     kept["motion"] = motion_section(found.motion).unwrap()
     kept["learner"] = {**learner, "inputs": list(found.learner_inputs)}
-    steps = [{"step": "shift", "channel": name, "samples": -1} for name in found.advanced]
-    if steps:
-        kept["data"] = {**data, "prepare": [*data.get("prepare", []), *steps]}
-    return kept | ({"suspects": moved} if moved else {})
+    if suspects:
+        kept["suspects"] = [_moved_suspect(suspect, found) for suspect in suspects]
+    structure = content.get("structure")
+    measure = structure.get("measure") if isinstance(structure, Mapping) else None
+    if isinstance(measure, Mapping) and isinstance(box := measure.get("box"), Mapping):
+        moved = {found.named(text): limits for text, limits in box.items()}
+        kept["structure"] = {**structure, "measure": {**measure, "box": moved}}  # type: ignore[dict-item]
+    if found.advanced:
+        shifts = [{"step": "shift", "channel": name, "samples": -1} for name in found.advanced]
+        kept["data"] = {**data, "prepare": [*steps, *shifts]}
+    return kept
+
+
+def _remembers(learner: Mapping[str, Any]) -> bool:
+    """Return whether a section declares states of a kind of learner that can have them."""
+    kind = learner.get("kind", "mlp")
+    known = isinstance(kind, str) and kind in LEARNERS
+    return bool(learner.get("states")) and known and hasattr(LEARNERS[kind], "states")
+
+
+def _is_list_of_text(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(one, str) for one in value)
+
+
+def _moved_suspect(suspect: Mapping[str, Any], found: LaggedMotion) -> dict[str, Any]:
+    """Return a suspect on states, in the equation of the output that it was in."""
+    moved = {"equation" if key == "output" else key: value for key, value in suspect.items()}
+    return moved | ({"on": found.named(suspect["on"])} if "on" in suspect else {})

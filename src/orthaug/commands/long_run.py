@@ -13,7 +13,13 @@ import numpy as np
 
 from orthaug._base.errors import Warning
 from orthaug._base.folders import whole_file
-from orthaug.commands.run import ReadOptions, check_instants, experiment_column, measured_outputs
+from orthaug.commands.run import (
+    ReadOptions,
+    check_instants,
+    experiment_column,
+    measured_outputs,
+    shifts_of,
+)
 from orthaug.data.parquet_source import open_parquet
 from orthaug.data.sources import Source
 from orthaug.data.tables import parquet_file
@@ -59,6 +65,7 @@ def long_run(model: Path, data: Path, reading: ReadOptions, *, free: bool) -> Lo
         not loaded.form.separates
         or experiment_column(loaded, data)
         or len(measured) < len(loaded.outputs)
+        or shifts_of(loaded)
     ):
         return None
     source = open_parquet(

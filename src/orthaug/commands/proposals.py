@@ -253,14 +253,20 @@ def _remembering_learner(job: Job) -> Iterator[Proposal]:
     if declared.get("states"):
         return
     change: dict[str, Any] = {"learner.states": 1}
+    words = f"{MISSING_STATE} in the learner (learner.states = 1)"
+    lagged = job.physics.section != "motion"
     if declared.get("kind", _NETWORK) != _NETWORK:
-        if job.physics.section == "motion":  # where to add a network is not known
+        if not lagged:  # where to add a network is not known
             return
         change = {"learner": {"kind": _NETWORK, "hidden": [_NEURONS], "states": 1}}
+        words = f"{MISSING_STATE} in a network of {_NEURONS} neurons (learner.states = 1)"
     elif job.spec.declared_learner() is None:
         return
-    words = f"{MISSING_STATE} in the learner (learner.states = 1)"
-    yield Proposal(words, change, learns=True, refocuses=True)
+    present = [lag.channel for lag in job.problem.layout if lag.lag == 0] if lagged else []
+    if len(present) > 1:  # a trial prepares its rows by one step
+        return
+    step = Shift(present[0], -1) if present else None
+    yield Proposal(words, change, learns=True, refocuses=True, step=step)
 
 
 def _state_explains_more(result: FitResult) -> bool:

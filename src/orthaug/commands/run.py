@@ -296,20 +296,22 @@ def _steps_of(
     When an input acts is a part of the model: without a choice its shift is done all the same.
     """
     steps, step = (), model.sampling_time
-    done = model.prepared if reading.prepare else _shifts(model) if reading.prepare is None else ()
+    done = (
+        model.prepared if reading.prepare else shifts_of(model) if reading.prepare is None else ()
+    )
     if done:
         steps, step = steps_again(done, [c.name for c in (*model.inputs, *outputs)], step)
     return steps, step / reading.every
 
 
-def _shifts(model: Model) -> tuple[Preparation, ...]:
+def shifts_of(model: Model) -> tuple[Preparation, ...]:
     """Return the shifts of inputs in the preparation of a model's training data."""
     return tuple(done for done in model.prepared if done.step == "shift")
 
 
 def _as_read(model: Model, reading: ReadOptions) -> str:
     """Return what was done to the rows of a file for which no preparation was asked."""
-    if reading.prepare is None and (shifts := _shifts(model)):
+    if reading.prepare is None and (shifts := shifts_of(model)):
         if len(shifts) == len(model.prepared):
             return "The same was done to these data; --no-prepare takes the rows as they are."
         return "The shift was done to these data; --prepare does all of it, --no-prepare nothing."

@@ -56,7 +56,8 @@ def open_select(path: Path) -> tuple[Job, Spec]:
     if spec.motion is not None:
         raise InputError(
             f"{path}: structure is selected for lagged signals; for a motion declare a learner "
-            'of terms (kind = "terms"), or a network, and run `orthaug explain` on it.'
+            'of terms (kind = "terms"), or a network, and run `orthaug explain` on it. For lagged '
+            "physics leave `learner.states` out."
         )
     if spec.engine.kind not in ("auto", "memory", "dask"):
         raise InputError(

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
+    ModelWrapValidatorHandler,
     PrivateAttr,
     ValidationError,
     ValidationInfo,
@@ -259,16 +260,26 @@ class Spec(Section):
     selection: SelectionSection = SelectionSection()
     engine: EngineSection = EngineSection()
     _folder: Path = PrivateAttr(default=Path())
+    _moved_lags: bool = PrivateAttr(default=False)
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _move_source(cls, content: dict[str, object]) -> dict[str, object]:
-        return with_lags_in_motion(with_source_in_motion(content))
+    def _move_physics(cls, content: Any, handler: ModelWrapValidatorHandler[Spec]) -> Spec:
+        given = with_source_in_motion(content)
+        moved = with_lags_in_motion(given)
+        spec = handler(moved)
+        spec._moved_lags = moved is not given
+        return spec
 
     @model_validator(mode="after")
     def _place(self, info: ValidationInfo) -> Spec:
         self._folder = (info.context or {}).get("folder", Path())
         return self
+
+    @property
+    def moved_lags(self) -> bool:
+        """True if the motion stands for lagged physics of the file."""
+        return self._moved_lags
 
     @property
     def folder(self) -> Path:

@@ -42,9 +42,10 @@ def add_retries(
 
     The latter have weaker regularizations, where evidence silenced all others. A short run without
     regularization from every seed comes first. Where none lowers the loss by more than so many
-    weights take from noise, evidence was right, and nothing is added. Otherwise the lowest goes on
-    to its end, with the ridge that evidence finds there: held-out rows then choose between
-    regularizations, where a run from every seed on every block would take most of the time.
+    weights take from noise, evidence was right, and nothing is added. Otherwise the lowest is
+    made again without that limit, and with the ridge that evidence finds there: held-out rows then
+    choose between regularizations, where a run from every seed on every block would take most of
+    the time.
 
     Args:
         starts, runs: planned runs and how they ended.
@@ -61,9 +62,10 @@ def add_retries(
     usable = [i for i, look in enumerate(looks) if look.ending.usable]
     if not usable:
         return starts, runs
-    lowest = min(usable, key=lambda i: _loss(looks[i]))
+    lowest = min(usable, key=lambda i: task.loss(looks[i]))
     start, end = free[lowest], looks[lowest]
-    if _is_chance(end, min(map(_loss, runs))):
+    silent = min(map(task.loss, runs))
+    if silent - task.loss(end) <= _chance(end) * silent:
         return starts, runs
     if end.ending is Ending.RUNNING:
         (start, *_), (end, *_) = make([start], None)
@@ -71,20 +73,14 @@ def add_retries(
     return [*starts, start, *more], [*runs, end, *others]
 
 
-def _is_chance(run: Any, silent: float) -> bool:
-    """Return whether a run lowers the loss of a silent learner by no more than noise explains.
+def _chance(run: Any) -> float:
+    """Return the share of the loss by which the weights of a run lower that of noise.
 
-    γ free parameters lower a sum of N squares of noise by χ²(γ)/N of it; coloured residuals count
-    as fewer.
+    γ free parameters lower a sum of N squares by χ²(γ)/N of it; coloured residuals count as fewer.
     """
     count, share = run.objective.samples(run.end.point)
     explained = run.effective + 2 * np.sqrt(2 * run.effective)
-    return bool(silent - _loss(run) <= explained / (count * share) * silent)
-
-
-def _loss(run: Any) -> float:
-    """Return the loss where a run ended, without its regularization."""
-    return run.end.point.loss
+    return float(explained / max(count * share, 1.0))
 
 
 def first_alike(starts: Sequence[PlannedRun], runs: Sequence[Any], outputs: int) -> list[int]:
