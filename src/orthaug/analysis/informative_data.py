@@ -150,7 +150,7 @@ def explains_nothing(
     )
     segment = max(rows // _PIECES, _SHORTEST)
     longer = steps is not None and not 0 < steps <= segment
-    if driven and longer and integrates(physics, part.record):
+    if inputs and driven and longer and integrates(physics, part.record):
         meant += (
             " The physics integrates: what it lacks adds up over the record and hides the rest. "
             f"Train on shorter runs (`segment` = {segment} in [training])."
