@@ -9,6 +9,7 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
+from orthaug.commands.opening import open_job
 from orthaug.commands.spec import load_spec
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import fit as fit_problem
@@ -215,3 +216,17 @@ def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(t
     assert best["change"] == {"learner.states": 1}
     assert best["after"] < 0.3 * best["before"]
     assert "hidden_state" in {warning["code"] for warning in result["warnings"]}
+
+
+def test_a_term_is_added_to_the_state_where_an_output_has_its_name(tmp_path):
+    record = plant(60)
+    rows = zip(record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0], strict=True)
+    (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
+    path = tmp_path / "spec.toml"
+    path.write_text(SPEC)
+    job = open_job(path)
+    change, where = job.physics.with_term(job, "s", "y*abs(y)", "y", 0.0)
+    assert where == "in the equation of y"
+    assert change["motion.states.y.next"].endswith("+ s*(y*abs(y))")
+    # A state of the learner is none of the physics
+    assert job.physics.with_term(job, "s", "atan(z1/2)", "y", 0.0) is None

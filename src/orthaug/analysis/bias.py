@@ -93,6 +93,11 @@ class TermPhysics(Protocol):
         ...
 
     @property
+    def memory(self) -> tuple[str, ...]:
+        """Names of the learner's own states."""
+        ...
+
+    @property
     def certifies(self) -> bool:
         """True if the points are few enough to seek certificates for terms that no one named."""
         ...

@@ -9,6 +9,7 @@ Gauss-Newton step.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import singledispatch
@@ -19,7 +20,7 @@ from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, Warning
-from orthaug._base.lines import first_words, percent, plain_number
+from orthaug._base.lines import first_words, join_words, percent, plain_number
 from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
 from orthaug.analysis.bias_hull import (
     LEAST,
@@ -349,7 +350,7 @@ def budget_by(
         large = [row for row in rows if row.cause == causes.name and _is_large(row)]
         if large:
             cure = terms_of(causes, terms).remedies(causes.entries[0], [row.name for row in large])
-            warnings.append(_biased_warning(causes, large, cure, learns=terms.learned is not None))
+            warnings.append(_biased_warning(causes, large, cure, terms))
     open_ones = [row.name for row in rows if not row.determined]
     if open_ones:
         cure = terms_of(found[0], terms).remedies(found[0].entries[0], open_ones)
@@ -553,11 +554,11 @@ def _is_large(row: ParameterBias) -> bool:
 
 
 def _biased_warning(
-    causes: Causes, large: Sequence[ParameterBias], remedies: Sequence[str], *, learns: bool
+    causes: Causes, large: Sequence[ParameterBias], remedies: Sequence[str], terms: BudgetTerms
 ) -> Warning:
     """Return the warning on large biases: causes, sizes, remedies, and how sure the causes are."""
-    several = len(causes.entries) > 1
-    cure = " or ".join([*(_as_physics(causes) if learns else ()), *remedies])
+    several, learns = len(causes.entries) > 1, terms.learned is not None
+    cure = " or ".join([*(_as_physics(causes, terms.memory) if learns else ()), *remedies])
     where = "" if causes.output is None else f" in {causes.output}"
     listed, moves = " and ".join(map(_describe_cause, causes.entries)), list_biases(large)
     rivals = sorted(causes.rivals, key=lambda entry: entry.share, reverse=True)
@@ -603,10 +604,11 @@ def _is_same(one: SuspectedBias, other: SuspectedBias) -> bool:
     return bool(apart <= _ALIKE_SHIFT * np.linalg.norm(other.shift))
 
 
-def _as_physics(causes: Causes) -> tuple[str, ...]:
+def _as_physics(causes: Causes, memory: Sequence[str]) -> tuple[str, ...]:
     """Return the remedy to write causes that explain nearly all into the physics; else none.
 
-    A term with memory is no expression of one row.
+    A term with memory is no expression of one row. One that reads a state of the learner, which
+    `memory` names, needs that state's equation, too.
     """
     suspects = [entry.suspect for entry in causes.entries]
     if causes.share < _WHOLE or any(one.memory is not None for one in suspects):
@@ -615,6 +617,9 @@ def _as_physics(causes: Causes) -> tuple[str, ...]:
         one.expression + (f" in the equation of {entry.equation}" if entry.equation else "")
         for one, entry in zip(suspects, causes.entries, strict=True)
     )
+    read = [name for name in memory if re.search(rf"\b{re.escape(name)}\b", named)]
+    if read:
+        return (f"let `orthaug explain` write {named} into the physics, with {join_words(read)}",)
     return (f"write {named} into the physics with a coefficient as parameter",)
 
 

@@ -107,6 +107,10 @@ class MotionTerms:
         return np.array([[p.min, p.max] for p in self.motion.parameters])
 
     @property
+    def memory(self) -> tuple[str, ...]:
+        return self.motion.memory
+
+    @property
     def certifies(self) -> bool:
         return len(self.field.x) <= MOST_POINTS
 

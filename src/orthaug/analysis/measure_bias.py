@@ -106,6 +106,10 @@ class LaggedTerms:
         return [s for s in self.catalogue.usual() if not has_term(jacobian, self.values(s))]
 
     @property
+    def memory(self) -> tuple[str, ...]:
+        return ()
+
+    @property
     def certifies(self) -> bool:
         return len(self.weighed.points.x) <= CERTIFIED_ROWS
 

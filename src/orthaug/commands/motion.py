@@ -16,6 +16,7 @@ from orthaug.analysis.suspects import MotionSuspect
 from orthaug.commands.job import MISSING_STATE, Job, JobPhysics, Variant, declared_output
 from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import declared_terms
+from orthaug.data.expressions import FUNCTIONS
 from orthaug.data.record import Record
 from orthaug.data.scales import describe_scales
 from orthaug.fitting.rules import check_motion_choices, check_solver, choose_regularizations
@@ -107,13 +108,14 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         from orthaug.physics.suspected_motion import equations_of, usual_places
 
         motion = self.motion
-        if motion.functions is not None:
+        if motion.functions is not None or not _reads_only(motion, expression):
             return None
         varying = (*motion.names_of_states, *motion.inputs)
         if place is None:
             places = usual_places(motion)
             place = equations_of(motion)[places[0]] if len(places) == 1 else None
-        if place in [output.name for output in motion.outputs]:
+        of_output = {output.name for output in motion.outputs} - {*motion.names_of_states}
+        if place in of_output:
             now = declared_output(job, str(place))
             own = now["expression"]
             if _has_term(own, expression, varying):
@@ -507,6 +509,13 @@ def _about_steps(problem: MotionProblem, trial: Trial) -> tuple[str, list[Warnin
             )
             warnings.append(Warning("other_hold", text))
     return " ".join(sentences), warnings
+
+
+def _reads_only(motion: Motion, expression: str) -> bool:
+    """Return whether an expression reads no name that the motion lacks: a state of the learner."""
+    names = set(re.findall(r"(?<![\w.])[A-Za-z_]\w*", expression))
+    defined = {name for name, _ in motion.definitions}
+    return names <= {*motion.known, *defined, *FUNCTIONS}
 
 
 def _has_term(equation: str, expression: str, varying: Sequence[str]) -> bool:
