@@ -700,3 +700,12 @@ def test_units_of_channels_stay_with_the_model():
     )
     found = estimate(named, PHYSICS, learner=None)
     assert [c.label for c in (*found.model.outputs, *found.model.inputs)] == ["y [m]", "u [N]"]
+
+
+def test_known_terms_alone_have_no_standard_errors():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=200)
+    record = Record.from_arrays(u=u, y=2 * u + 0.3 * u**3 + 0.1 * rng.normal(size=200))
+    known = Baseline.from_terms([Term("k", "u[k]", initial=2.0, fixed=True)])
+    found = estimate(record, known, learner=MLP(hidden=(4,)))
+    assert found.physics_alone is not None and found.physics_alone.std.shape == (0,)

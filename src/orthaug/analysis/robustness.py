@@ -49,6 +49,8 @@ def with_suited_errors(fit: Estimate, *, ordered: bool = True) -> Estimate:
         fit = replace(fit, physics_alone=with_suited_errors(fit.physics_alone, ordered=ordered))
     if isinstance(fit.problem, StreamedProblem) or not fit.status.ok or not fit.robust_kinds:
         return fit
+    if not fit.problem.names and not fit.learns:  # known terms alone
+        return fit
     return attempt("the robust covariance", lambda: _suited(fit, ordered=ordered), [], fit)
 
 
