@@ -841,7 +841,7 @@ BAD = {
     "ensemble": (
         "restarts = 1",
         "ensemble = true\nrestarts = 2",
-        "`training.ensemble`: a motion has none",
+        "`training.ensemble`: a motion, or a learner with `states`, has none",
     ),
     "structure": (
         "[training]",
