@@ -82,7 +82,7 @@ def test_its_parameters_hold_where_those_of_physics_alone_do_not(fit):
         row = table.loc[name]
         assert abs(row["value"] - true) < 4 * row["std"] < 0.02 * true
         other = alone.loc[name]
-        assert abs(other["value"] - true) > 10 * other["std"]
+        assert abs(other["value"] - true) > 3 * other["std"]  # robust: its errors are coloured
 
 
 def test_its_free_run_is_as_good_as_that_of_the_true_equations(fit, measured):
