@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from orthaug.commands.opening import open_job
 from orthaug.commands.spec import load_spec
 from orthaug.data.regressors import Lags
 from orthaug.fitting.estimation import fit as fit_problem
-from orthaug.physics.lagged_motion import motion_of_lags
+from orthaug.physics.lags_as_states import motion_of_lags
 from orthaug.physics.parameters import PhysicalParameter, PhysicsMap
 from orthaug.physics.problem import pose
 
@@ -63,6 +64,14 @@ def plant(rows: int = 500, seed: int = 0) -> oa.Record:
         y[k] = 1.6 * y[k - 1] - 0.7 * y[k - 2] + 0.2 * u[k - 1] - 0.3 * np.tanh(brake)
     y = y + 0.003 * rng.standard_normal(rows)
     return oa.Record.from_arrays(u=u, y=y, sampling_time=0.1)
+
+
+def write_run(folder: Path, rows: int, *, present: bool = False) -> None:
+    """Write `run.csv` of the plant; with `present` the input acts on the row that it is in."""
+    (experiment,) = plant(rows).experiments
+    u, y = experiment.inputs[:, 0], experiment.outputs[:, 0]
+    pairs = zip(u[:-1], y[1:], strict=True) if present else zip(u, y, strict=True)
+    (folder / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in pairs))
 
 
 def test_states_are_the_lags():
@@ -159,9 +168,7 @@ def test_a_problem_of_lagged_physics_is_refused():
 
 
 def test_a_spec_with_a_learner_that_remembers_is_one_of_a_motion(tmp_path):
-    record = plant(60)
-    rows = zip(record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0], strict=True)
-    (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
+    write_run(tmp_path, 60)
     path = tmp_path / "spec.toml"
     path.write_text(SPEC)
     spec = load_spec(path)
@@ -200,12 +207,7 @@ def test_a_brake_that_lags_is_learned_to_the_noise():
 
 @pytest.mark.parametrize("present", [False, True])
 def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(tmp_path, present):
-    record = plant(900)
-    u, y = record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0]
-    if present:
-        u, y = u[:-1], y[1:]
-    rows = zip(u, y, strict=True)
-    (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
+    write_run(tmp_path, 900, present=present)
     path, spec = tmp_path / "spec.toml", SPEC.replace("states = 1\n", "")
     spec = spec.replace("u[k-1]", "u[k]").replace("nb = 2", "nb = 2\nnk = 0") if present else spec
     path.write_text(spec)
@@ -219,9 +221,7 @@ def test_a_learner_that_remembers_is_the_first_advice_where_a_state_is_missing(t
 
 
 def test_a_term_is_added_to_the_state_where_an_output_has_its_name(tmp_path):
-    record = plant(60)
-    rows = zip(record.experiments[0].inputs[:, 0], record.experiments[0].outputs[:, 0], strict=True)
-    (tmp_path / "run.csv").write_text("u,y\n" + "".join(f"{u},{y}\n" for u, y in rows))
+    write_run(tmp_path, 60)
     path = tmp_path / "spec.toml"
     path.write_text(SPEC)
     job = open_job(path)

@@ -27,6 +27,13 @@ from pydantic import (
 
 from orthaug._base.errors import InputError, KeyedError, SpecError
 from orthaug._base.registry import resolve
+from orthaug.commands.baseline_sections import (
+    BaselineSection,
+    LagsSection,
+    Orders,
+    PhysicsSection,
+    with_lags_in_motion,
+)
 from orthaug.commands.controller_section import ControllerSection
 from orthaug.commands.data_sections import (
     Data,
@@ -35,13 +42,6 @@ from orthaug.commands.data_sections import (
     Range,
     SourceSection,
     with_source_in_motion,
-)
-from orthaug.commands.lagged_sections import (
-    BaselineSection,
-    LagsSection,
-    Orders,
-    PhysicsSection,
-    with_lags_in_motion,
 )
 from orthaug.commands.sections import (
     Count,
@@ -278,7 +278,7 @@ class Spec(Section):
 
     @property
     def moved_lags(self) -> bool:
-        """True if the motion stands for lagged physics of the file."""
+        """True if the motion takes the place of lagged physics in the file."""
         return self._moved_lags
 
     @property

@@ -51,7 +51,7 @@ from orthaug.models.tasks import runs_on
 from orthaug.physics.baseline import Baseline
 from orthaug.physics.closed_loop import in_loop
 from orthaug.physics.controller import Controller
-from orthaug.physics.lagged_motion import motion_of_lags
+from orthaug.physics.lags_as_states import motion_of_lags
 from orthaug.physics.motion import Motion
 from orthaug.physics.problem import MotionProblem, Problem
 from orthaug.physics.systems import System

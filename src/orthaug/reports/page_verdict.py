@@ -475,9 +475,8 @@ def _use_text(result: FitResult, level: str) -> str:
         else:
             text += imitable.doubt
     if bare:
-        one = ("has no interval", "it is"), ("have no intervals", "they are")
-        has, they = one[len(bare) > 1]
-        text += f". {join_words(bare)} {has}, which would say how close to physics {they}"
+        have = "has no interval" if len(bare) == 1 else "have no intervals"
+        text += f". {join_words(bare)} {have}, which would say how close to physics that is"
     text += (
         f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
         "physics"

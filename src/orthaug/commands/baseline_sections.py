@@ -18,7 +18,7 @@ from orthaug.models.kinds import LEARNERS
 from orthaug.models.learners import Learner
 from orthaug.models.terms import over_lags
 from orthaug.physics.baseline import Baseline, Term
-from orthaug.physics.lagged_motion import LaggedMotion, motion_of_lags
+from orthaug.physics.lags_as_states import LaggedMotion, motion_of_lags
 from orthaug.physics.parameters import PhysicsMap
 
 Orders = Count | list[Count]
