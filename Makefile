@@ -25,7 +25,7 @@ proofs: $(STAMP)  ## run the slow tests and proofs, which the suite leaves out, 
 	@$(BIN)/python -m pytest -q -m "(proof or slow) and not long" -n auto --dist loadfile --no-loadscope-reorder
 
 long: $(STAMP)  ## run the tests of 16 s or more, which CI leaves out, before a release
-	@$(BIN)/python -m pytest -q -m long -n auto --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -q -m long -o faulthandler_timeout=0 -n auto --dist loadfile --no-loadscope-reorder
 
 fuzz: $(STAMP)  ## run 3,000 seeded hostile trials and print how many held, by area
 	@$(BIN)/python benchmarks/fuzz.py

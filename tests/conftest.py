@@ -8,6 +8,7 @@ import platform
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import slow
@@ -92,6 +93,23 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
     gc.set_threshold(100_000, 20, 100)
+
+
+def pytest_handlecrashitem(crashitem: str, report: pytest.TestReport, sched: Any) -> None:
+    """What takes its worker down is run again by another, and counted as a rerun; twice fails.
+
+    pytest-xdist 3.8 gives the files that the worker had ended to others, too: with nothing left to run
+    there, these would wait for each other.
+    """
+    for name, tests in list(sched.workqueue.items()):
+        if all(tests.values()):
+            del sched.workqueue[name]
+    if crashitem not in _CRASHED:
+        _CRASHED.add(crashitem)
+        report.outcome = "rerun"  # type: ignore[assignment]
+
+
+_CRASHED: set[str] = set()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
