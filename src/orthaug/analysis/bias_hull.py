@@ -29,7 +29,7 @@ from orthaug._base.lines import first_words, percent
 from orthaug.inference.covariance import reach
 
 # Over 17 forms, half of them in no catalogue, the right bias was within in 130 draws; in 128 by 8
-_AS_CLOSE = 12.0
+AS_LIKELY = 12.0
 # 500 rows at 2 % noise: of a Stribeck law with v² the truth is then missed in 1 % of 100 draws
 # instead of 17, of Coulomb's in 3 % of 60 (benchmarks/README.md, silent misses)
 _MIXED = 7.0
@@ -69,6 +69,10 @@ class NamedCause(Candidate):
         return self.rest + np.zeros(len(self.moved))
 
 
+class OtherForm(Candidate):
+    """Another form of a term whose form was selected from the data."""
+
+
 def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]:
     """Return the causes that noise cannot distinguish from the best.
 
@@ -81,7 +85,7 @@ def compatible(candidates: Sequence[Candidate], noise: float) -> list[Candidate]
     if not likely:
         return []
     best = max(c.share for c in likely)
-    left = min(_AS_CLOSE * (1 - best + noise), 1 - LEAST * best)
+    left = min(AS_LIKELY * (1 - best + noise), 1 - LEAST * best)
     kept = [c for c in likely if 1 - c.share <= left]
     return [c for c in kept if c.declared] or kept
 

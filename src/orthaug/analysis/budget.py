@@ -21,7 +21,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.lines import first_words, join_words, percent, plain_number
-from orthaug.analysis.bias import SuspectedBias, TermPhysics, bias_table
+from orthaug.analysis.bias import SuspectedBias, bias_table
 from orthaug.analysis.bias_hull import (
     LEAST,
     MOST_PHYSICS,
@@ -29,7 +29,6 @@ from orthaug.analysis.bias_hull import (
     NamedCause,
     compatible,
     hull,
-    is_determined,
     most_mixed,
     undetermined_warning,
 )
@@ -41,8 +40,14 @@ from orthaug.analysis.causes import (
     explain_residual,
 )
 from orthaug.analysis.free_run_bias import linearize_fit
-from orthaug.analysis.mapped_bias import physical_with_bias
 from orthaug.analysis.measure_bias import linearization_of
+from orthaug.analysis.parameter_bias import (
+    EstimatedTerms,
+    ParameterBias,
+    owners_of,
+    parameter_biases,
+    physical_biases,
+)
 from orthaug.analysis.suspects import (
     ODD_JUMPS,
     MotionSuspect,
@@ -56,31 +61,11 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.physics.parameters import PhysicsMap
 
 _ROUNDING = 1e-9  # of a parameter: a bias that no one can speak of
-_ALIKE = 1e-6  # of a bias
 _ALIKE_SHIFT = 0.05  # of it: terms that move the parameters alike
 _SAME = 1e-3  # of a share: terms that differ less are one term by two names
 _WHOLE = 0.95  # of what the learner found: a cause that may replace it
 _LISTED = 4  # parameters that a warning lists at most
 _FEWEST_LEFT = 5  # rows beyond what was fitted: where fewer are left any term explains the learner
-
-
-@dataclass(frozen=True)
-class ParameterBias:
-    """Bias of a parameter, estimate less truth, with an interval that covers bias and noise."""
-
-    name: str
-    value: float
-    cause: str
-    share: float
-    relative: float | None
-    errors: float | None
-    """Its size in standard errors; None where there are none."""
-    ci95: tuple[float, float] | None
-    """The hull over all causes that noise cannot separate; None where that determines nothing."""
-    determined: bool = True
-    """True if the data determine the parameter beside this learner: the hull is no wider than the
-    value itself.
-    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +102,8 @@ class Budget:
         )
 
 
-class BudgetTerms(TermPhysics, Protocol):
+class BudgetTerms(EstimatedTerms, Protocol):
     """A fit whose learner is to be explained: what a budget needs beside the table of biases."""
-
-    @property
-    def fit(self) -> Any:
-        """The estimate."""
-        ...
 
     @property
     def learned(self) -> Matrix | None:
@@ -133,11 +113,6 @@ class BudgetTerms(TermPhysics, Protocol):
     @property
     def bounds(self) -> Matrix:
         """Bounds (nθ, 2) of the parameters."""
-        ...
-
-    @property
-    def map(self) -> PhysicsMap | None:
-        """The map from physical parameters to θ."""
         ...
 
     def considered(
@@ -342,9 +317,9 @@ def budget_by(
     noise = np.full((len(value), 2), np.nan) if fit.interval is None else fit.interval
     ends = hull(value, noise, fit.freedom, candidates, other)
     ends = np.clip(ends, *terms.bounds.T[:, :, None])
-    owners = _owners(found, np.array([causes.moved for causes in found]))
+    owners = owners_of(found, np.array([causes.moved for causes in found]))
     parameters = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
-    physical, unbounded = _physical_rows(terms, found, candidates, other)
+    physical, unbounded = physical_biases(terms, found, candidates, other)
     rows, warnings = (*physical, *parameters), []
     for causes in found:
         large = [row for row in rows if row.cause == causes.name and _is_large(row)]
@@ -443,109 +418,6 @@ def _mixtures(terms: BudgetTerms, causes: Causes, others: Vector) -> list[Candid
         moved = (1 - t) * best.shift + t * entry.shift
         found.append(Candidate(name, share, moved + others))
     return found
-
-
-def _owners(found: Sequence[Causes], moved: Float[np.ndarray, "k n"]) -> list[tuple[str, float]]:
-    """Return for each parameter the causes that move it most, and their share.
-
-    Of causes that move it alike the first: a dead zone and a saturation differ by a damper.
-    """
-    size = np.abs(moved)
-    most = size >= (1 - _ALIKE) * size.max(axis=0)
-    return [(found[i].name, found[i].share) for i in np.argmax(most, axis=0)]
-
-
-def _physical_rows(
-    terms: BudgetTerms,
-    found: Sequence[Causes],
-    candidates: Sequence[Candidate],
-    other: Vector,
-) -> tuple[tuple[ParameterBias, ...], list[Warning]]:
-    """Return the biases of the physical parameters: the hull over the causes that matter.
-
-    Those are the causes that move any of them farthest.
-    """
-    if terms.map is None:
-        return (), []
-    fit, slopes, count = terms.fit, terms.physical, len(terms.names)
-    physical = fit.physical(terms.map)
-    own = np.array([np.nan if s is None else s for s in physical.std])
-    turned = (
-        np.array([slopes[0][name] for name in physical.names]) if slopes else np.zeros((0, count))
-    )
-    chosen = [candidates[0]]
-    for row in turned:
-        for sign in (-1.0, 1.0):
-            wide = [
-                sign * row @ c.moved + np.sqrt(np.sum((row * c.unsure) ** 2)) for c in candidates
-            ]
-            chosen.append(candidates[int(np.argmax(np.nan_to_num(wide, nan=-np.inf)))])
-    ends, shifts = [], np.zeros(len(physical.names))
-    for i, c in enumerate({id(c): c for c in chosen}.values()):
-        spread = np.outer(c.unsure, c.unsure) + np.diag(other) ** 2
-        spread = spread + (0.0 if fit.covariance is None else fit.covariance)
-        known = terms.map, fit.problem, terms.value, c.moved
-        moves, limits = physical_with_bias(*known, fit.covariance, spread, fit.freedom)
-        shifts = shifts if i else moves
-        ends.append(limits)
-    # NaN where one has none
-    ends = np.stack([np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]], axis=-1)
-    moved = np.array([causes.moved for causes in found])
-    owners = _owners(found, moved @ turned.T) if slopes else []
-    rows = parameter_biases(physical.names, physical.value, own, shifts, ends, owners, fit.freedom)
-    return rows, _unbounded_warnings(physical.names, own, ends)
-
-
-def parameter_biases(
-    names: Sequence[str],
-    value: Vector,
-    std: Vector,
-    bias: Vector,
-    ends: Matrix,
-    causes: Sequence[tuple[str, float]],
-    freedom: float,
-) -> tuple[ParameterBias, ...]:
-    """Return a row for each parameter whose bias is known.
-
-    `ends` are those of its interval, `causes` names and shares.
-    """
-    found = []
-    for name, v, s, b, ci, (cause, share) in zip(
-        names, value, std, bias, ends, causes, strict=True
-    ):
-        if np.isfinite(b):
-            errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
-            limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
-            determined = limits is None or is_determined(float(v), float(s), freedom, *limits)
-            found.append(
-                ParameterBias(
-                    name,
-                    float(b),
-                    cause,
-                    share,
-                    relative,
-                    errors,
-                    limits if determined else None,
-                    determined,
-                )
-            )
-    return tuple(found)
-
-
-def _unbounded_warnings(names: Sequence[str], std: Vector, ends: Matrix) -> list[Warning]:
-    """Return a warning where physical parameters have an interval but no bounded bias."""
-    none = [
-        name
-        for name, s, e in zip(names, std, ends, strict=True)
-        if np.isfinite(s) and not np.isfinite(e).all()
-    ]
-    if not none:
-        return []
-    text = (
-        f"no interval of {', '.join(none)} includes the bias: some values of theta within the "
-        "wider intervals"
-    )
-    return [Warning("physics_not_met", f"{text} correspond to no physical parameters.")]
 
 
 def _is_large(row: ParameterBias) -> bool:

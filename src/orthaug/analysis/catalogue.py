@@ -59,12 +59,15 @@ class Family(NamedTuple):
     text: Callable[[str, str], str]
     members: tuple[float, ...]
     scaled: bool = True
+    level: Callable[[str, str], str] | None = None
+    """Writes one that acts on what is never negative, where that is shorter."""
 
-    def expression(self, on: str, width: str) -> str:
+    def expression(self, on: str, width: str, *, level: bool = False) -> str:
         """Return the member of a width, or power, that acts on an expression."""
+        text = self.level if level and self.level else self.text
         if _WHOLE.fullmatch(on):
-            return self.text(on, width)
-        return self.text(f"({on})", width).replace(f"(({on}))", f"({on})")
+            return text(on, width)
+        return text(f"({on})", width).replace(f"(({on}))", f"({on})")
 
 
 def _odd_power(x: str, power: str) -> str:
@@ -82,6 +85,13 @@ FAMILIES = (
 )
 
 
+RIVALS = (
+    *(family for family in FAMILIES if family.name != "power"),
+    Family("power", _odd_power, (*_POWERS, 3.5, 4.0, 5.0), False, lambda x, w: f"{x}**{w}"),
+    Family("exp", lambda x, w: f"exp({x}/{w})", (0.5, 1.0, 2.0)),
+    Family("decay", lambda x, w: f"exp(-{x}/{w})", (0.5, 1.0, 2.0)),
+)
+"""What may take the place of a term whose form was selected: a radiation is no cubic."""
 SMOOTH_FRICTION = {family.name: family for family in FAMILIES if family.name in ("tanh", "atan")}
 """Families of friction that turns round smoothly."""
 
@@ -223,12 +233,12 @@ class Catalogue:
             for text in self.products
         )
 
-    def families(self) -> tuple[Any, ...]:
+    def families(self, families: Sequence[Family] = FAMILIES) -> tuple[Any, ...]:
         """Return every member of every family, on everything that the learner sees."""
         return tuple(
             self.of_text(text, argument.text, place, f"{name}{self._label(place)}")
             for argument in self.seen
-            for name, text in family_members(argument.text, argument.values)
+            for name, text in family_members(argument.text, argument.values, families)
             for place in self.places
         )
 
@@ -236,7 +246,9 @@ class Catalogue:
         return f" in {place}" if len(self.places) > 1 else ""
 
 
-def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
+def family_members(
+    on: str, values: Vector, families: Sequence[Family] = FAMILIES
+) -> Iterator[tuple[str, str]]:
     """Yield name and expression of every member of every family for an expression `on`.
 
     Those that are not `scaled` are named by their expression: a power is no square of x.
@@ -245,10 +257,10 @@ def family_members(on: str, values: Vector) -> Iterator[tuple[str, str]]:
     if not np.any(size > 0):
         return
     median = float(np.median(size[size > 0]))
-    for family in FAMILIES:
+    for family in families:
         for member in family.members:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
-            text = family.expression(on, w)
+            text = family.expression(on, w, level=bool(np.min(values, initial=0.0) >= 0))
             named = text.startswith(f"{family.name}(") or not family.scaled  # as tanh(v/0.5) is
             yield text if named else f"{family.name}({on}, {w})", text
 

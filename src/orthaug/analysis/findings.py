@@ -76,7 +76,10 @@ class CertificateResult(Content):
 
 
 class BiasResult(Content):
-    """The bias of a parameter by the learned part: estimate less truth, its cause and share."""
+    """The bias of a parameter by the learned part: estimate less truth, its cause and share.
+
+    Without a share the cause is another form of a term whose form was selected from the data.
+    """
 
     value: Number
     cause: str

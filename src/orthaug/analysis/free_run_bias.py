@@ -9,11 +9,12 @@ slopes ∂f/∂q of the learned equations over the measure's points for Φ.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug.analysis.absorbed import complementary_parameters
@@ -26,10 +27,11 @@ from orthaug.analysis.bias import (
     seen_table,
 )
 from orthaug.analysis.bias_hull import MOST_PHYSICS
-from orthaug.analysis.catalogue import Catalogue, soften_jumps
+from orthaug.analysis.catalogue import RIVALS, Catalogue, soften_jumps
 from orthaug.analysis.causes import AS_CLOSE, CLOSE, MOST_POINTS, SURE_SHARE, Considered
 from orthaug.analysis.free_run_equations import FreeRunPoint, TermEquations, respond_to
 from orthaug.analysis.learned_part import learned_reach
+from orthaug.analysis.rival_forms import Forms
 from orthaug.analysis.robustness import block_of
 from orthaug.analysis.suspects import MotionSuspect, check_motion_suspects
 from orthaug.fitting.field_points import field_under
@@ -54,6 +56,7 @@ from orthaug.physics.suspected_motion import equations_of
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
 # Of the learned equations: a learner that is smaller, and biases nothing, found nothing
 _NOTHING = 0.01
+_ALMOST_GONE = 1e-6  # of a coefficient: what only shapes its term has no effect then
 _UNMOVED = 0.1  # standard errors of every parameter
 
 
@@ -138,17 +141,13 @@ class MotionTerms:
 
     def usual(self) -> list[MotionSuspect]:
         """Return the usual suspects that the physics does not have, with widths from the run."""
-        place, motion = self.place, self.motion
-        segmented = place.segmented if len(place.w) else place.segmented.physics_only
-        x, u = segmented.trajectory(place.c, place.w, place.states)
-        there = np.isfinite(x).all(axis=1)
-        x, u = x[there], u[there]
+        motion = self.motion
+        x, u = self._run
         found = Catalogue.of_motion(motion, motion.initial, x, u, self._seen).usual()
-        spread = np.unique(np.linspace(0, len(x) - 1, MOST_POINTS).astype(int)) if len(x) else []
-        if not len(spread):
+        if not len(x):
             return list(found)
-        x, u = x[spread], u[spread]
-        slopes = np.asarray(slopes_at(segmented.dynamics.physics_only, self.q, x, u))
+        x, u = spread(x), spread(u)
+        slopes = self._slopes(self.q, x, u)
         if not np.isfinite(slopes).all():
             return list(found)
         jacobian, equations = Projection.factor(slopes), range(slopes.shape[1])
@@ -158,6 +157,58 @@ class MotionTerms:
             return has_term(jacobian, values * np.isin(equations, suspect.place(motion)))
 
         return [suspect for suspect in found if not known(suspect)]
+
+    @cached_property
+    def _run(self) -> tuple[Matrix, Matrix]:
+        """States (M, nx) and inputs (M, nu) of the free run, where they are finite."""
+        place = self.place
+        segmented = place.segmented if len(place.w) else place.segmented.physics_only
+        x, u = segmented.trajectory(place.c, place.w, place.states)
+        there = np.isfinite(x).all(axis=1)
+        return x[there], u[there]
+
+    def _slopes(self, q: Vector, x: Matrix, u: Matrix) -> Float[np.ndarray, "m r np"]:
+        """Return ∂(f, h)/∂q of the physics at points."""
+        return np.asarray(slopes_at(self.place.segmented.dynamics.physics_only, q, x, u))
+
+    def forms(self, selected: int) -> Forms[MotionSuspect] | None:
+        """Return other forms of the term of a parameter, on all states and inputs.
+
+        None where it acts in several equations.
+        """
+        motion, x, u = self.motion, *map(spread, self._run)
+        if motion.functions is not None or not len(x):
+            return None
+        slopes = self._slopes(self.q, x, u)
+        acts = np.flatnonzero(np.any(slopes[:, :, selected], axis=0))
+        if len(acts) != 1:
+            return None
+        place = equations_of(motion)[acts[0]]
+        named = (*motion.names_of_states, *motion.inputs)
+        read = [name for name in named if name in motion.visible]
+        catalogue = Catalogue.of_motion(motion, self.value, x, u, read)
+        catalogue = replace(catalogue, places=(place,))
+        every = (*catalogue.usual(), *catalogue.families(RIVALS))
+        values = np.stack([form.values(motion, self.value, x, u) for form in every], axis=1)
+        others = ~self.shapes(selected)
+        others[selected] = False
+        here = slopes[:, acts[0]]
+        return Forms(every, values, here[:, others], here[:, selected])
+
+    def with_forms(self, forms: Sequence[MotionSuspect]) -> TermEquations:
+        """Return the normal equations of the free run with further terms."""
+        return respond_to(self.place, tuple(form.term(self.motion) for form in forms))
+
+    def shapes(self, selected: int) -> Bool[np.ndarray, "np"]:
+        """Return a mask of the parameters that have no effect where that one is nearly 0."""
+        x, u = map(spread, self._run)
+        p = self.value.copy()
+        p[selected] *= _ALMOST_GONE
+        gone = self.motion.coordinates.of(p)
+        size, left = (np.linalg.norm(self._slopes(q, x, u), axis=(0, 1)) for q in (self.q, gone))
+        found = left <= np.sqrt(_ALMOST_GONE) * size
+        found[selected] = False
+        return found
 
     @cached_property
     def catalogue(self) -> Catalogue:
@@ -334,6 +385,13 @@ class MotionTerms:
         return moves(
             lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points
         )
+
+
+def spread(rows: np.ndarray) -> np.ndarray:
+    """Return rows at even distances, `MOST_POINTS` at most."""
+    if len(rows) <= MOST_POINTS:
+        return rows
+    return rows[np.unique(np.linspace(0, len(rows) - 1, MOST_POINTS).astype(int))]
 
 
 def residual_steps(

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError
@@ -20,11 +21,12 @@ from orthaug.analysis.bias import (
     seen_table,
 )
 from orthaug.analysis.bias_hull import MOST_PHYSICS
-from orthaug.analysis.catalogue import Catalogue, saturations
+from orthaug.analysis.catalogue import RIVALS, Argument, Catalogue, saturations
 from orthaug.analysis.causes import Considered
 from orthaug.analysis.imitation import other_inputs
 from orthaug.analysis.mapped_bias import physical_of, physical_slopes
-from orthaug.analysis.suspects import Suspect
+from orthaug.analysis.rival_forms import Forms
+from orthaug.analysis.suspects import Suspect, evaluate_rows
 from orthaug.data.expressions import parse
 from orthaug.data.regressors import Features
 from orthaug.fitting.lagged_estimate import LaggedEstimate
@@ -46,7 +48,16 @@ from orthaug.physics.shared import seen_columns, shared_directions
 CERTIFIED_ROWS = 200_000
 _REMOVED = 0.1  # of a bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
+_FORM_ROWS = 20_000  # on which other forms of a term are tried
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
+
+
+class RowEquations(NamedTuple):
+    """Normal equations of θ and of the coefficients of further terms (`FormEquations`)."""
+
+    information: Matrix
+    gradient: Vector
+    fitted: Bool[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +232,58 @@ class LaggedTerms:
         noise = np.sum(times(self.weighed.unit, rows) ** 2) / own.shape[1]
         taken = fit.effective_weights / self.problem.count * noise
         return float(taken / max(np.sum(own**2), np.finfo(float).tiny))
+
+    def forms(self, selected: int) -> Forms[Suspect] | None:
+        """Return other forms of the term of a parameter: on its own lags, and the usual ones.
+
+        None where it acts on several outputs.
+        """
+        problem, every = self.problem, self._every
+        x, outputs = problem.rows.x[every], problem.outputs
+        phi = problem.phi(x)
+        acts = np.flatnonzero(np.any(phi[:, :, selected], axis=0))
+        if len(acts) != 1:
+            return None
+        output, name = outputs[acts[0]], problem.names[selected]
+        read = [
+            str(lag)
+            for term in problem.baseline.terms or ()
+            if term.parameter == name
+            for lag in parse(term.regressor, dict(problem.baseline.constants)).lags
+        ]
+        seen = [Argument(text, self._values_of(text, x)) for text in dict.fromkeys(read)]
+        catalogue = replace(self.catalogue, places=(output,), seen=(*seen,))
+        every_form = (*catalogue.usual(), *catalogue.two_lags(), *catalogue.families(RIVALS))
+        own = np.delete(phi[:, acts[0]], selected, axis=1)
+        with np.errstate(all="ignore"):  # of an exponential that overflows none is tried
+            values = [self._values_of(form.expression, x) for form in every_form]
+        return Forms(every_form, np.stack(values, axis=1), own, phi[:, acts[0], selected])
+
+    def with_forms(self, forms: Sequence[Suspect]) -> RowEquations:
+        """Return the least squares of θ and of further terms on the training rows."""
+        problem, every = self.problem, self._every
+        x, weight = problem.rows.x[every], problem.weight.matrix
+        terms = [self._sampled(form).values(x, problem.layout, problem.outputs) for form in forms]
+        rows = np.concatenate([problem.phi(x), np.stack(terms, axis=-1)], axis=-1)
+        rows = np.einsum("oi,nik->nok", weight, rows).reshape(-1, rows.shape[-1])
+        count = len(self.theta)
+        basis = np.linalg.qr(rows[:, :count])[0]
+        left = problem.unexplained[every].ravel()
+        left = left - basis @ (basis.T @ left)
+        fitted = np.arange(rows.shape[1]) < count
+        return RowEquations(rows.T @ rows, rows.T @ left, fitted)
+
+    def shapes(self, selected: int) -> Bool[np.ndarray, "nt"]:
+        """Return none: all parameters multiply their terms."""
+        return np.zeros(len(self.theta), dtype=bool)
+
+    @property
+    def _every(self) -> slice:
+        """Every so many of the training rows."""
+        return slice(None, None, 1 + len(self.problem.rows.x) // _FORM_ROWS)
+
+    def _values_of(self, text: str, x: Matrix) -> Vector:
+        return evaluate_rows(parse(text), x, self.problem.layout, f"'{text}'")
 
     def remedies(self, cause: SuspectedBias, biased: Sequence[str]) -> list[str]:
         """Return sentences on how to remove the bias of the named parameters, easiest first."""

@@ -17,6 +17,7 @@ from orthaug.analysis.budget import Budget, budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import physical_rows
+from orthaug.analysis.form_budget import budget_by_forms
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
@@ -183,7 +184,7 @@ def _of_lagged(
         ),
         "budget": attempt_warned(
             "the bias that the learner implies",
-            lambda: budget_on(terms(), suspects) if _splits(fit) else None,
+            lambda: budget_on(terms(), suspects) if _splits(fit) else budget_by_forms(terms()),
             warnings,
         ),
     }
@@ -316,5 +317,5 @@ def _biases(
     if terms is None:
         return None, None
     table = bias_table(terms, suspects)
-    budget = budget_on(terms, suspects, table)
+    budget = budget_on(terms, suspects, table) or budget_by_forms(terms)
     return _with_causes([entry.as_dict() for entry in table], budget) or None, budget

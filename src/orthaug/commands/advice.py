@@ -482,8 +482,11 @@ def _freed_text(names: Sequence[str]) -> str:
     """Return what a fit without a learner is good for, as a sentence."""
     if not names:
         return ""
-    intervals = "its interval holds" if len(names) == 1 else "their intervals hold"
-    return f" No learner then imitates {join_words(names)}; {intervals} for this form alone."
+    intervals = "its interval" if len(names) == 1 else "their intervals"
+    return (
+        f" No learner then imitates {join_words(names)}; other forms of the term that fit as well "
+        f"count in {intervals}."
+    )
 
 
 def _error_text(one: ProposalErrors, before: float) -> str:

@@ -50,6 +50,7 @@ class TermSection(Section):
     fixed: bool = False
     min: Finite | None = None
     max: Finite | None = None
+    selected: bool | None = None
 
     @property
     def declared(self) -> Term:

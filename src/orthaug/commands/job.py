@@ -560,6 +560,11 @@ def _toml(job: Job) -> str:
     return toml_of(job.declaration)
 
 
+def selected_form(expression: str) -> dict[str, bool]:
+    """Return the key of a term that data have proposed; a constant has no other form."""
+    return {} if expression == "1" else {"selected": True}
+
+
 def declared_output(job: Job, name: str) -> dict[str, Any]:
     """Return the section of a motion's output: its expression, and whether it is learned."""
     own = job.declaration["motion"]["outputs"][name]

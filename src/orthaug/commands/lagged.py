@@ -15,7 +15,7 @@ from orthaug._base.lines import plural
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.physics_findings import bias_before, imitable_before
 from orthaug.analysis.suspects import Suspect
-from orthaug.commands.job import Job, JobPhysics, Variant
+from orthaug.commands.job import Job, JobPhysics, Variant, selected_form
 from orthaug.commands.parts import FilePart
 from orthaug.commands.spec import Spec
 from orthaug.commands.suspects import declared_suspects
@@ -105,9 +105,8 @@ class LaggedPhysics(JobPhysics[Problem, "LaggedEstimate"]):
         if any(_is_same(term, expression, place) for term in terms):
             return None
         output = {"output": place} if several else {}
-        change: dict[str, object] = {
-            "baseline.terms": [*terms, {"parameter": name, "regressor": expression, **output}]
-        }
+        term = {"parameter": name, "regressor": expression, **output, **selected_form(expression)}
+        change: dict[str, object] = {"baseline.terms": [*terms, term]}
         if spec.physics is not None:
             change[f"physics.parameters.{name}"] = {"initial": initial or 1.0}
             change[f"physics.theta.{name}"] = name

@@ -13,7 +13,14 @@ import numpy as np
 from orthaug._base.errors import InputError, KeyedError, RankError, Warning
 from orthaug.analysis.memory import derivative_of, next_of
 from orthaug.analysis.suspects import MotionSuspect
-from orthaug.commands.job import MISSING_STATE, Job, JobPhysics, Variant, declared_output
+from orthaug.commands.job import (
+    MISSING_STATE,
+    Job,
+    JobPhysics,
+    Variant,
+    declared_output,
+    selected_form,
+)
 from orthaug.commands.spec import Spec, spec_error
 from orthaug.commands.suspects import declared_terms
 from orthaug.data.expressions import FUNCTIONS
@@ -122,7 +129,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
                 return None
             change = {
                 f"motion.outputs.{place}": now | {"expression": f"{own} + {name}*({expression})"},
-                f"motion.parameters.{name}": {"initial": initial},
+                f"motion.parameters.{name}": {"initial": initial} | selected_form(expression),
             }
             return change, f"in the equation of the output {place}"
         if place in motion.inputs:
@@ -135,7 +142,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return None
         change = {
             f"motion.states.{place}.{key}": f"{own} + {name}*({expression})",
-            f"motion.parameters.{name}": {"initial": initial},
+            f"motion.parameters.{name}": {"initial": initial} | selected_form(expression),
         }
         return change, f"in the equation of {place}"
 
@@ -159,7 +166,7 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             for path, text in texts.items()
             if word.search(text)
         }
-        change[f"motion.parameters.{name}"] = {"initial": initial}
+        change[f"motion.parameters.{name}"] = {"initial": initial} | selected_form(expression)
         return change, f"beside the input {place}"
 
     def with_lag(

@@ -46,6 +46,7 @@ class PhysicalSection(Section):
     unit: str = ""
     min: Finite | None = None
     max: Finite | None = None
+    selected: bool = False
 
     def declared(self, name: str) -> PhysicalParameter:
         """Return the parameter of this name."""
@@ -53,7 +54,7 @@ class PhysicalSection(Section):
             -math.inf if self.min is None else self.min,
             math.inf if self.max is None else self.max,
         )
-        return PhysicalParameter(name, self.initial, self.unit, low, high)
+        return PhysicalParameter(name, self.initial, self.unit, low, high, self.selected)
 
 
 class KindSection(Section):

@@ -33,13 +33,18 @@ _PARAMETERS = "a tuple of Parameters; `Baseline.from_terms` makes them from term
 
 @dataclass(frozen=True)
 class Parameter:
-    """One entry of θ: name, initial value θ⁰, unit and the bounds `min` and `max`."""
+    """One entry of θ: name, initial value θ⁰, unit and the bounds `min` and `max`.
+
+    `selected` says that the form of its term was selected from the data: other forms that fit as
+    well then count in the intervals of all parameters.
+    """
 
     name: str
     initial: float = 0.0
     unit: str = ""
     min: float = -math.inf
     max: float = math.inf
+    selected: bool = False
 
     def __post_init__(self) -> None:
         check_parameter_name(self.name)
@@ -93,7 +98,8 @@ class Term:
     `initial`, `unit` and the bounds `min` and `max` belong to the parameter: one of its terms gives
     them, or none (0, no unit, no bounds). `fixed` keeps `initial` as a known coefficient: the term
     is subtracted from the output first, and the learner is not made orthogonal to it. `output` may
-    be left out where there is only one.
+    be left out where there is only one. `selected` says that the form of the regressor was selected
+    from the data: other forms that fit as well then count in the intervals.
 
     Examples:
         >>> kept = Term("one", "y[k-1]", initial=1.0, fixed=True)
@@ -109,6 +115,7 @@ class Term:
     fixed: bool = False
     min: float | None = None
     max: float | None = None
+    selected: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -371,7 +378,14 @@ class Baseline(NotebookView):
         return xp.asarray(phi)
 
 
-_SHARED = ("initial", "unit", "fixed", "min", "max")  # what the terms of one parameter share
+_SHARED = (
+    "initial",
+    "unit",
+    "fixed",
+    "min",
+    "max",
+    "selected",
+)  # what the terms of one parameter share
 
 
 def _unify(terms: Sequence[Term]) -> list[Term]:
@@ -419,7 +433,8 @@ def _unify(terms: Sequence[Term]) -> list[Term]:
 def _parameter(term: Term) -> Parameter:
     low = -math.inf if term.min is None else float(term.min)
     high = math.inf if term.max is None else float(term.max)
-    return Parameter(term.parameter, float(term.initial or 0.0), term.unit or "", low, high)
+    own = float(term.initial or 0.0), term.unit or "", low, high, bool(term.selected)
+    return Parameter(term.parameter, *own)
 
 
 def derived_units(

@@ -135,11 +135,12 @@ class PhysicalParameter:
     """One entry of p: name, initial value, unit and bounds.
 
     A `min` of 0 says that it is positive: it is then estimated as a logarithm, and its interval is
-    positive too.
+    positive too. `selected` says that it is the coefficient of a term whose form was selected from
+    the data: other forms that fit as well then count in the intervals of all parameters.
 
     Examples:
         >>> PhysicalParameter("m", 1.2, "kg", min=0)
-        PhysicalParameter(name='m', initial=1.2, unit='kg', min=0, max=inf)
+        PhysicalParameter(name='m', initial=1.2, unit='kg', min=0, max=inf, selected=False)
     """
 
     name: str
@@ -147,6 +148,7 @@ class PhysicalParameter:
     unit: str = ""
     min: float = -math.inf
     max: float = math.inf
+    selected: bool = False
 
 
 @dataclass(frozen=True)

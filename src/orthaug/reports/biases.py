@@ -62,9 +62,36 @@ def biased_by(rows: Sequence[ParameterResult]) -> dict[tuple[str, float], list[P
     """Return the parameters with a bias, by its cause and the share that this explains."""
     found: dict[tuple[str, float], list[ParameterResult]] = {}
     for row in rows:
-        if row.bias:
-            found.setdefault((row.bias.cause, row.bias.share or 0.0), []).append(row)
+        if row.bias and row.bias.share is not None:
+            found.setdefault((row.bias.cause, row.bias.share), []).append(row)
     return found
+
+
+OF_FORMS = (
+    "Other forms of a selected term fit as well. The largest bias by any of them, and the interval "
+    "that holds for all:"
+)
+
+
+def hang_on_form(rows: Sequence[ParameterResult]) -> list[ParameterResult]:
+    """Return the parameters that another form of a selected term would change."""
+    return [row for row in rows if row.bias and row.bias.share is None]
+
+
+def is_biased(row: ParameterResult) -> bool:
+    """Return whether a bias is larger than the standard error."""
+    return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
+
+
+def size_of_bias(rows: Sequence[ParameterResult]) -> str:
+    """Return the size of the largest bias: of the value, and in standard errors."""
+    worst = max(rows, key=lambda row: row.errors_of_bias)
+    if worst.bias is None or worst.bias.value is None:
+        return ""
+    times = f"{plain_number(worst.errors_of_bias)} times its standard error"
+    share = percent(worst.bias.value / worst.value, sign="+") if worst.value else ""
+    size = f"{share}, {times}" if share else times
+    return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
 
 
 def bias_map(suspects: Sequence[SuspectResult]) -> BiasMap:

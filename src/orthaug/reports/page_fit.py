@@ -14,7 +14,7 @@ from orthaug.analysis.findings import MotionFitResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.fitting.estimates import STD_KINDS
 from orthaug.models.response import Response
-from orthaug.reports.biases import biased_by
+from orthaug.reports.biases import OF_FORMS, biased_by, hang_on_form
 from orthaug.reports.learned_part import LearnedPart
 from orthaug.reports.page_blocks import (
     CATEGORIES,
@@ -173,6 +173,8 @@ def _parameters(result: FitResult) -> list[Any]:
             )
         what = "what the learner found" if result.learns else "the squared residual of the free run"
         blocks.append(Text(f"The bias budget: of {what}{text}{more}."))
+    if hang_on_form(rows):
+        blocks.append(Text(f"{OF_FORMS[:-1]}, are in the table."))
     if result.physical_consistency:
         blocks.append(Text(result.physical_consistency.text))
     if result.shared is not None:

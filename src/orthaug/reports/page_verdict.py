@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthaug._base.lines import join_words, plain_number
+from orthaug._base.lines import join_words
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
 from orthaug.analysis.fit_findings import ParameterResult, PartScores
 from orthaug.analysis.missing_term import may_be_missing
+from orthaug.reports.biases import hang_on_form, is_biased, size_of_bias
 from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
 
@@ -312,15 +313,22 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             "its stability is not proved, because the local spectral radius exceeds 1 on a "
             "part of its free run"
         )
-    biased = [row.name for row in _rows(result) if _is_biased(row)]
+    formed = [row for row in hang_on_form(_rows(result)) if is_biased(row)]
+    if formed:
+        names = [row.name for row in formed]
+        yield (
+            f"{join_words(names)} hang{'s' if len(names) == 1 else ''} on the form of a term that "
+            f"was selected from the data{size_of_bias(formed)}"
+        )
+    biased = [row.name for row in _rows(result) if is_biased(row) and row not in formed]
     if biased:
         guessed = any(
             row.bias and (row.bias.share or 0.0) < SURE_SHARE
             for row in _rows(result)
-            if _is_biased(row)
+            if row.name in biased
         )
         probably = guessed and getattr(result, "motion", None) is None
-        size = _size_of_bias([row for row in _rows(result) if _is_biased(row)])
+        size = size_of_bias([row for row in _rows(result) if row.name in biased])
         verb = "is" if len(biased) == 1 else "are"
         yield f"{join_words(biased)} {verb} {'probably ' * probably}biased{size}"
     if result.residuals is not None and not _noise_alone(result):
@@ -368,17 +376,6 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         )
 
 
-def _size_of_bias(rows: Sequence[ParameterResult]) -> str:
-    """Return the size of the largest bias: of the value, and in standard errors."""
-    worst = max(rows, key=lambda row: row.errors_of_bias)
-    if worst.bias is None or worst.bias.value is None:
-        return ""
-    times = f"{plain_number(worst.errors_of_bias)} times its standard error"
-    share = percent(worst.bias.value / worst.value, signed=True) if worst.value else ""
-    size = f"{share}, {times}" if share else times
-    return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
-
-
 def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
     """Return the parameters that twice the substeps would move by half a standard error or more."""
     motion = getattr(result, "motion", None)
@@ -393,10 +390,6 @@ def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
 def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
     physical = None if isinstance(result, RowResult) else result.physical_parameters
     return [*result.parameters, *(physical or [])]
-
-
-def _is_biased(row: ParameterResult) -> bool:
-    return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
 
 
 _SEARCH_ONLY = "Use it only to search for missing physics"
@@ -514,7 +507,7 @@ def _noise_alone(result: FitResult | RowResult) -> bool:
 def _is_known(row: ParameterResult) -> bool:
     """Return whether a parameter may be read as physics."""
     sure = row.std is not None and row.value is not None and 0 < row.std <= _SURE * abs(row.value)
-    return sure and not row.shared and not _is_biased(row)
+    return sure and not row.shared and not is_biased(row)
 
 
 def _quote_names(names: list[str]) -> str:
@@ -603,7 +596,7 @@ def _option(result: FitResult) -> str | None:
 
 def _predicted_change(result: FitResult) -> str | None:
     """Return the change with the largest predicted gain, where none was tried."""
-    causes = [row.bias for row in _rows(result) if _is_biased(row) and row.bias]
+    causes = [row.bias for row in _rows(result) if is_biased(row) and row.bias and row.bias.share]
     cause = max(causes, key=lambda bias: bias.share or 0.0, default=None)
     missing = (
         result.residuals.missing.terms if result.residuals and result.residuals.missing else []

@@ -24,7 +24,7 @@ from orthaug._base.lines import (
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.findings import SharedResult, SuspectResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
-from orthaug.reports.biases import REMOVED_BY, biased_by
+from orthaug.reports.biases import OF_FORMS, REMOVED_BY, biased_by, hang_on_form
 from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
 from orthaug.reports.result import (
     CheckResult,
@@ -351,7 +351,8 @@ def _bias_lines(result: Findings) -> list[str]:
                 f"{100 * share:.0f} % of what the {what} is {cause}. The resulting bias{held}:"
             )
         lines += _bias_table([row for row in own if row.value is not None])
-    return lines
+    by_form = hang_on_form(rows)
+    return [*lines, OF_FORMS, *_bias_table(by_form)] if by_form else lines
 
 
 def _bias_table(rows: Sequence[ParameterResult]) -> list[str]:

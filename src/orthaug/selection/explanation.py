@@ -99,6 +99,7 @@ def added_to_baseline(
             initial=one.coefficient,
             unit=one.unit or "",
             output=one.added_to if several else None,
+            selected=True,
         )
         for one in added
     ]
@@ -184,7 +185,7 @@ def added_to_motion(
             texts[one.added_to] = f"({inside['inner']}{summand})/{inside['by']}"
         else:
             texts[one.added_to] = f"{text}{summand}"
-        new.append(PhysicalParameter(one.name, factor * coefficient, unit or ""))
+        new.append(PhysicalParameter(one.name, factor * coefficient, unit or "", selected=True))
     changed = Motion.from_equations(
         states=[replace(state, derivative=texts[state.name]) for state in motion.states],
         outputs=[replace(output, expression=texts[output.name]) for output in motion.outputs],

@@ -1,0 +1,83 @@
+"""What other forms of selected terms would make of the parameters, as a budget of biases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from orthaug._base.checks import Vector
+from orthaug._base.errors import Warning
+from orthaug._base.lines import first_words, join_words
+from orthaug.analysis.bias_hull import AS_LIKELY, OtherForm, hull
+from orthaug.analysis.budget import Budget, BudgetTerms
+from orthaug.analysis.parameter_bias import (
+    farthest,
+    owners_of,
+    parameter_biases,
+    physical_biases,
+)
+from orthaug.analysis.rival_forms import RivalForm, SelectedTerms, rival_forms
+
+_LISTED = 3  # forms and parameters that a warning lists at most
+
+
+class FormTerms(BudgetTerms, SelectedTerms, Protocol):
+    """A fit whose selected terms may have other forms."""
+
+
+def budget_by_forms(terms: FormTerms) -> Budget | None:
+    """Return the bias of every parameter by the forms that fit as well as the selected ones.
+
+    None where a learner is beside the physics, and where no form was selected or has a rival.
+    """
+    if terms.learned is not None or not any(p.selected for p in terms.fit.problem.parameters):
+        return None
+    rivals = rival_forms(terms)
+    if not rivals:
+        return None
+    fit, value = terms.fit, terms.value
+    moved = np.array([rival.moved for rival in rivals])
+    forms = [OtherForm(rival.name, 1.0, rival.moved) for rival in rivals]
+    every = [OtherForm("the selected form", 1.0, np.zeros(len(value))), *forms]
+    noise = np.full((len(value), 2), np.nan) if fit.interval is None else fit.interval
+    ends = np.clip(hull(value, noise, fit.freedom, every), *terms.bounds.T[:, :, None])
+    bias, std = farthest(moved), fit.known_std
+    owners = owners_of(forms, moved)
+    rows = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
+    physical, unbounded = physical_biases(terms, forms, every)
+    rows, physical = (tuple(row for row in of if row.value) for of in (rows, physical))
+    warnings = [_warning(rivals, terms.names, value, moved, std), *unbounded]
+    return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
+
+
+def _warning(
+    rivals: Sequence[RivalForm],
+    names: Sequence[str],
+    value: Vector,
+    moved: np.ndarray,
+    std: Vector,
+) -> Warning | None:
+    """Return the warning that other forms imply other values; None where they do not."""
+    size = np.abs(moved).max(axis=0) / np.where(std > 0, std, np.inf)
+    large = [i for i in np.argsort(-size) if size[i] > 1]
+    if not large:
+        return None
+    parameters = list(dict.fromkeys(rival.parameter for rival in rivals))
+    forms = list(dict.fromkeys(rival.name for rival in rivals))
+    implied = np.vstack([value, value - moved])
+    reach = [
+        f"{names[i]} from {implied[:, i].min():.4g} to {implied[:, i].max():.4g}"
+        for i in large[:_LISTED]
+    ]
+    whose = f"the term{'s' if len(parameters) > 1 else ''} of {join_words(parameters)}"
+    first = f" {rivals[0].name} fits clearly better." if rivals[0].rise < -AS_LIKELY else ""
+    return Warning(
+        "rival_forms",
+        f"the form of {whose} was selected from these data, and {first_words(forms, _LISTED)} "
+        f"fit{'s' if len(forms) == 1 else ''} as well: with these forms {join_words(reach)}. The "
+        "standard errors hold for the selected form alone, the intervals with the bias for all of "
+        f"these.{first} Remedy: data over a wider range. Where the form is known from elsewhere, "
+        "leave out `selected`.",
+    )

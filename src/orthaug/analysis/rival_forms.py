@@ -1,0 +1,206 @@
+"""Rival forms of a term that was selected from the data: what they would make of the parameters.
+
+A term that data have proposed, `r*T**3` for a radiation, is one of several forms that these data
+can hardly tell apart, and each leaves another value to the parameters beside it. The standard
+errors know of one form only. So each form of the catalogue takes the term's place, in the fit's own
+equations to first order: with A their information and g their gradient over parameters and forms,
+the term's coefficient p falls to 0, `δ_p = −p̂`, and all others follow,
+
+    δ = A⁻¹(g − A_p δ_p),    while the squares rise by  A_pp δ_p² − 2 g_p δ_p − (g − A_p δ_p)ᵀδ.
+
+A form that rises them by no more than 12 variances of the errors over the best may be the true one:
+as for causes of a learner (`bias_hull`). The change of the equations is small for such a form,
+whatever the size of the term, so that the first order is enough. The interval of a parameter is the
+hull over them (`form_budget`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.bias_hull import AS_LIKELY
+from orthaug.analysis.free_run_equations import solve_scaled
+
+_MOST_FORMS = 24  # tried in the fit's equations: those that are most alike
+_BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
+_SAME = 1e-3  # of what two forms do: they are one by two names
+_SPANNED = 1e-10  # of a term's squares: what is left of one that others express
+_PLAIN = 0.3  # times the size of a term beside the physics: what leaves less of a form is physics
+_UNLIKE = 0.1  # of a term's squares beside the physics: a form that leaves no more is tried
+_MOST_UNLIKE = 0.5  # one that leaves more is not, whatever the noise
+
+
+T = TypeVar("T")
+
+
+class Forms(NamedTuple, Generic[T]):
+    """Other forms of a term, over points where the physics was."""
+
+    forms: Sequence[T]
+    values: Float[np.ndarray, "m k"]
+    slopes: Float[np.ndarray, "m n"]
+    """Of the equation by the other parameters."""
+    own: Float[np.ndarray, "m"]
+    """The term for a coefficient of 1."""
+
+    def most_alike(self, least: float) -> list[T]:
+        """Return the forms that explain a term beside the physics, the best first.
+
+        Args:
+            least: share of it that a form explains at least.
+        """
+        with np.errstate(all="ignore"):
+            there = np.isfinite(self.slopes).all(axis=1) & np.isfinite(self.own)
+        values, own = self.values[there], self.own[there]
+        usable = np.isfinite(values).all(axis=0)
+        values = np.where(usable, values, 0.0)
+        size = np.linalg.norm(self.slopes[there], axis=0)
+        basis = np.linalg.qr(self.slopes[there] / np.where(size > 0, size, 1.0))[0]
+        term, others = own - basis @ (basis.T @ own), values - basis @ (basis.T @ values)
+        whole, squares = float(term @ term), np.sum(others**2, axis=0)
+        beside = whole / max(float(own @ own), np.finfo(float).tiny)
+        if not beside > _SPANNED:
+            return []
+        # What is nearly the physics itself fits anything with a huge size
+        usable &= squares > _PLAIN**2 * beside * np.sum(values**2, axis=0)
+        shares = np.where(usable, (term @ others) ** 2 / np.where(usable, squares, 1.0), 0.0)
+        order = np.argsort(-shares, kind="stable")
+        # What explains all of it is the term itself, by another name
+        return [
+            self.forms[k] for k in order if least * whole <= shares[k] <= (1 - _SPANNED) * whole
+        ][:_MOST_FORMS]
+
+
+class FormEquations(Protocol):
+    """Normal equations of the coordinates c, of the coefficients of other forms, and of weights."""
+
+    @property
+    def information(self) -> Matrix: ...
+
+    @property
+    def gradient(self) -> Vector: ...
+
+    @property
+    def fitted(self) -> Bool[np.ndarray, "n"]:
+        """Mask of what the fit has estimated."""
+        ...
+
+
+class SelectedTerms(Protocol):
+    """A fit with terms whose forms were selected: all that differs between kinds of physics."""
+
+    @property
+    def fit(self) -> Any:
+        """The estimate."""
+        ...
+
+    @property
+    def value(self) -> Vector:
+        """The parameters (nθ,)."""
+        ...
+
+    @property
+    def slopes(self) -> Vector:
+        """Derivatives (nθ,) of the parameters by their coordinates."""
+        ...
+
+    def forms(self, selected: int) -> Forms[Any] | None:
+        """Return other forms of a term; None where none can take its place.
+
+        Args:
+            selected: place of its coefficient among the parameters.
+        """
+        ...
+
+    def with_forms(self, forms: Sequence[Any]) -> FormEquations | None:
+        """Return the fit's normal equations with further terms; None where there are none."""
+        ...
+
+    def shapes(self, selected: int) -> Bool[np.ndarray, "nt"]:
+        """Return a mask of the parameters that only shape a term, such as its width."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class RivalForm:
+    """Form that may be true in place of the one in the physics."""
+
+    parameter: str
+    """Coefficient of the term."""
+    suspect: Any
+    rise: float
+    """By how much the squares rise with it, in variances of the errors; negative: they fall."""
+    moved: Vector
+    """The parameters (nθ,) less what they are with this form."""
+
+    @property
+    def name(self) -> str:
+        """The form as an expression."""
+        return _BRACKETED.sub(r"\1", self.suspect.expression)
+
+    def is_same(self, other: RivalForm) -> bool:
+        """Return whether another form is this one by another name."""
+        apart = np.linalg.norm(self.moved - other.moved)
+        close = abs(self.rise - other.rise) <= _SAME * max(1.0, abs(self.rise))
+        return close and bool(apart <= _SAME * np.linalg.norm(self.moved))
+
+
+def rival_forms(terms: SelectedTerms) -> list[RivalForm]:
+    """Return the forms that fit as well as those that were selected, the best first.
+
+    Empty without a selected term, and where the coefficient has no standard error.
+    """
+    found: list[RivalForm] = []
+    for place, parameter in enumerate(terms.fit.problem.parameters):
+        std = terms.fit.known_std[place]
+        if parameter.selected and terms.value[place] != 0 and std > 0:
+            found += _rivals_of(terms, place, float(abs(terms.value[place]) / std))
+    found.sort(key=lambda rival: rival.rise)
+    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))]
+
+
+def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
+    """Return the rivals of one term, whose coefficient is `t` standard errors large."""
+    # A form that differs by what noise hides in the fit's equations may differ by more at points
+    least = 1 - max(_UNLIKE, min(4 * AS_LIKELY / t**2, _MOST_UNLIKE))
+    forms = terms.forms(place)
+    likely = [] if forms is None else forms.most_alike(least)
+    equations = terms.with_forms(likely) if likely else None
+    if equations is None:
+        return []
+    information, gradient, count = equations.information, equations.gradient, len(terms.value)
+    if not np.isfinite(information).all() or not np.isfinite(gradient).all():
+        return []
+    others = equations.fitted.copy()
+    others[:count] &= ~terms.shapes(place)
+    others[place] = False
+    across = information[others, place]
+    own = information[place, place] - across @ solve_scaled(
+        information[np.ix_(others, others)], across
+    )
+    if not own > 0:
+        return []
+    slope = terms.slopes[place]
+    gone = -terms.value[place] / slope
+    found = []
+    for k, form in enumerate(likely):
+        free = others.copy()
+        free[count + k] = True
+        pull = gradient[free] - information[free, place] * gone
+        step = solve_scaled(information[np.ix_(free, free)], pull)
+        rise = information[place, place] * gone**2 - 2 * gradient[place] * gone - pull @ step
+        moved = np.zeros(len(free))
+        moved[free] = step
+        shift = -(terms.slopes * moved[:count])
+        shift[place] = 0.0  # its coefficient is none of another form
+        name = terms.fit.problem.names[place]
+        found.append(RivalForm(name, form, float(rise / (own * gone**2) * t**2), shift))
+    best = min(0.0, *(rival.rise for rival in found))
+    return [rival for rival in found if rival.rise - best <= AS_LIKELY]
