@@ -13,6 +13,7 @@ from test_cli import run
 from test_golden import FOLDER, asked, lasting
 
 import orthaug as oa
+from orthaug.reports.result import FitResult
 
 GOLDEN = (
     "lagged_bounds",
@@ -110,6 +111,8 @@ def test_the_fit_of_the_demo_in_python_says_what_the_command_says(tmp_path: Path
     assert not list(differences(kept, lasting(shown), relative=RELATIVE, floor=RELATIVE))
     printed = str(found)
     assert max(map(len, printed.splitlines())) <= 80
+    assert found.verdict == FitResult.model_validate(written).verdict
+    assert " ".join(printed.split()).endswith(f"Verdict: {found.verdict}")
     for row in found.parameters:
         assert f"\n{row.name} " in printed
     for warning in found.warnings:

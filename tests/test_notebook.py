@@ -27,7 +27,6 @@ from orthaug.analysis.findings import BiasResult
 from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.commands import bars
 from orthaug.reports.html import card_of_result, html_of
-from orthaug.reports.result import FitResult
 
 VOID = {"br", "meta", "hr", "link", "img", "input"}
 KINDS = ("free_run", "one_step", "residuals", "learned", "parameters", "bode")
@@ -190,7 +189,7 @@ def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
         bias=BiasResult(value=0.125, cause="friction", share=0.95),
         ci95_with_bias=[1.9, 2.9],
     )
-    result = FitResult.model_construct(
+    result = fit.diagnose(blocks=0).changed(
         parameters=[row],
         physical_parameters=None,
         warnings=[Warning(code="biased", text="friction moves m")],

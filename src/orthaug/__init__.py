@@ -50,6 +50,13 @@ def _findings(fit: Any, findings: Any, *, html: bool) -> str:
         return fit_text(fit, findings) or fit.status.message
 
 
+def _verdict(findings: Any) -> str:
+    from orthaug.reports.page_verdict import fit_verdict
+
+    verdict = fit_verdict(findings)
+    return f"{verdict.trust} {verdict.use}"
+
+
 def _intervals(fit: Any, *, ordered: bool = True) -> Any:
     from orthaug.analysis.robustness import with_suited_errors
 
@@ -63,7 +70,7 @@ def _progress() -> Any:
 
 
 MAKERS.update(html=_html, plot=_plot, report=_report, progress=_progress)
-MAKERS.update(diagnose=_diagnose, findings=_findings, intervals=_intervals)
+MAKERS.update(diagnose=_diagnose, findings=_findings, verdict=_verdict, intervals=_intervals)
 
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

@@ -65,7 +65,8 @@ class FitView(NotebookView):
         Returns:
             The `Findings`: `parameters` with their biases and intervals, `scores`, `residuals`,
             `unexplained`, `bias` by suspects, `stability`, `validation` with the verdict on the
-            learner, `warnings` with their codes; `content()` is what result.json has.
+            learner, `warnings` with their codes, `verdict` on the model in words; `content()` is
+            what result.json has.
 
         Raises:
             InputError: records, suspects or a map that do not fit the model.

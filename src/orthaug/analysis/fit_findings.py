@@ -293,6 +293,11 @@ class Findings(Content):
         """The `Estimate` with the standard errors of the findings; None if they were read."""
         return self._fit
 
+    @property
+    def verdict(self) -> str:
+        """Whether the model is reliable, and what it is good for, in two sentences or more."""
+        return MAKERS["verdict"](self)
+
     def __str__(self) -> str:
         return repr(self) if self._fit is None else MAKERS["findings"](self._fit, self, html=False)
 

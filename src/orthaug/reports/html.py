@@ -208,7 +208,7 @@ def card_of_result(fit: Estimate, result: Findings) -> Card:
             known = row.bias is None or row.bias.determined
             shown = _compact(reach) if known else "not determined"
             own += [_number(row.bias.value if row.bias else None, 3), shown]
-    notes = [warning.text for warning in result.warnings]
+    notes = [f"Verdict: {result.verdict}", *(warning.text for warning in result.warnings)]
     return replace(card_of(fit), tables=[Table(columns, rows)], notes=notes)
 
 

@@ -11,11 +11,11 @@ from orthaug._base.lines import join_words
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
-from orthaug.analysis.fit_findings import ParameterResult, PartScores
+from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores
 from orthaug.analysis.missing_term import may_be_missing
 from orthaug.reports.biases import hang_on_form, is_biased, size_of_bias
 from orthaug.reports.page_blocks import number, percent
-from orthaug.reports.result import CompareResult, DataResult, FitResult, RowResult
+from orthaug.reports.result import CompareResult, FitResult, RowResult
 
 _GOOD, _POOR = 0.2, 0.5  # NRMSE of a free run up to which it is close, and from which it is far
 _ALIKE = 1.1  # ratio of errors up to which models are called equally good
@@ -53,9 +53,16 @@ class PageVerdict(NamedTuple):
         return self.trust, self.use, self.then
 
 
-def fit_verdict(result: FitResult) -> PageVerdict:
-    """Return the verdict of a fit, from its own findings."""
-    doubts = list(_doubts(result, result.data))
+def fit_verdict(result: Findings) -> PageVerdict:
+    """Return the verdict of a fit, from its own findings.
+
+    A next step needs a spec: of a fit in Python it is empty.
+    """
+    if isinstance(result, FitResult):
+        held_out = bool(result.data.tests or result.data.validation)
+    else:
+        held_out = len(result.scores) > 1
+    doubts = list(_doubts(result, held_out=held_out))
     error, part = _worst_score(result.scores)
     unstable = _has_warning(result, _UNSTABLE)  # no score of a free run judges it
     bad = (
@@ -83,7 +90,8 @@ def fit_verdict(result: FitResult) -> PageVerdict:
     )
     causes = (w.text.split(":")[0] for w in result.warnings if w.code == "one_step_only")
     first = next((f"{cause[0].upper()}{cause[1:]}. " for cause in causes), "")
-    return PageVerdict(level, f"{first}{opening}{shown}{because}.", use, _next_step(result))
+    then = _next_step(result) if isinstance(result, FitResult) else ""
+    return PageVerdict(level, f"{first}{opening}{shown}{because}.", use, then)
 
 
 def compare_verdict(result: CompareResult) -> PageVerdict:
@@ -100,7 +108,8 @@ def compare_verdict(result: CompareResult) -> PageVerdict:
     best = best_row(result)[0]
     row = next(row for row in result.comparison if row.name == best)
     error, part = _worst_score(row.scores)
-    doubts = list(_doubts(row, result.data))
+    held_out = bool(result.data.tests or result.data.validation)
+    doubts = list(_doubts(row, held_out=held_out))
     level = (
         "good"
         if error is not None and error <= _GOOD
@@ -264,7 +273,7 @@ def _worst_score(
     return (found[part], part) if found else (None, "")
 
 
-def _code(result: FitResult | RowResult) -> str | None:
+def _code(result: Findings | RowResult) -> str | None:
     """Return the verdict on the learner.
 
     None without one, or where physics alone was chosen.
@@ -276,22 +285,22 @@ def _code(result: FitResult | RowResult) -> str | None:
     )
 
 
-def _has_warning(result: FitResult | RowResult, code: str) -> bool:
+def _has_warning(result: Findings | RowResult, code: str) -> bool:
     return any(warning.code == code for warning in result.warnings)
 
 
-def is_biased_by_feedback(result: FitResult | RowResult) -> bool:
+def is_biased_by_feedback(result: Findings | RowResult) -> bool:
     """Return whether feedback is in the data, and no noise model that leaves white errors."""
     white = result.residuals is not None and result.residuals.verdict == "white"
     return _has_warning(result, "closed_loop") and not (_has_noise_model(result) and white)
 
 
-def _has_noise_model(result: FitResult | RowResult) -> bool:
+def _has_noise_model(result: Findings | RowResult) -> bool:
     """Return whether the noise was modelled; rows of a comparison do not say."""
     return bool(getattr(result, "noise", None))
 
 
-def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
+def _doubts(result: Findings | RowResult, *, held_out: bool) -> Iterator[str]:
     """Yield the objections to the model, the gravest first."""
     runaway = [w.text.split(":")[0] for w in result.warnings if w.code == _RAN_AWAY]
     if runaway:
@@ -300,11 +309,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         yield "its training data have no more rows than it has unknowns"
     if _code(result) == "hurts":
         yield "its learner makes the free run worse than physics alone"
-    if (
-        not data.tests
-        and not data.validation
-        and not (result.validation and result.validation.trials)
-    ):
+    if not held_out and not (result.validation and result.validation.trials):
         yield "it was not tested on held-out data"
     if (result.status if isinstance(result, RowResult) else result.status.code) in _STOPPED:
         yield "training stopped before it converged"
@@ -376,7 +381,7 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
         )
 
 
-def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
+def _moved_by_integrator(result: Findings | RowResult) -> list[str]:
     """Return the parameters that twice the substeps would move by half a standard error or more."""
     motion = getattr(result, "motion", None)
     moved = {} if motion is None else motion.substep_bias or {}
@@ -387,7 +392,7 @@ def _moved_by_integrator(result: FitResult | RowResult) -> list[str]:
     ]
 
 
-def _rows(result: FitResult | RowResult) -> list[ParameterResult]:
+def _rows(result: Findings | RowResult) -> list[ParameterResult]:
     physical = None if isinstance(result, RowResult) else result.physical_parameters
     return [*result.parameters, *(physical or [])]
 
@@ -425,7 +430,7 @@ _UNTESTED = {
 """Doubts by warnings that no test of the residual sees."""
 
 
-def _use_text(result: FitResult, level: str) -> str:
+def _use_text(result: Findings, level: str) -> str:
     rows, coarse = _rows(result), _moved_by_integrator(result)
     sure = [row.name for row in rows if _is_known(row) and row.name not in coarse]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
@@ -487,7 +492,7 @@ def _use_text(result: FitResult, level: str) -> str:
     return f"Use it to {text}."
 
 
-def _may_lack_terms(result: FitResult | RowResult) -> bool:
+def _may_lack_terms(result: Findings | RowResult) -> bool:
     """Return whether terms explain most of a coloured error, which is less than sure."""
     found = result.residuals
     if found is None or found.verdict != "equation_noise" or found.missing is None:
@@ -495,7 +500,7 @@ def _may_lack_terms(result: FitResult | RowResult) -> bool:
     return may_be_missing(found.missing.p, found.missing.share)
 
 
-def _noise_alone(result: FitResult | RowResult) -> bool:
+def _noise_alone(result: Findings | RowResult) -> bool:
     """Return whether the residual shows nothing that would bias the parameters.
 
     Noise on the sensor biases those of one step ahead, which a warning says.
@@ -623,7 +628,7 @@ def _cause_option(cause: BiasResult, learned: bool) -> str:
     return f"“{cause.cause}” in the physics, because {percent(cause.share)} of {what} {looks}"
 
 
-def _is_undecided(result: FitResult) -> bool:
+def _is_undecided(result: Findings) -> bool:
     """Return whether physics alone was handed over although the learner may help."""
     ratio = None if result.validation is None else result.validation.ratio
     return (

@@ -51,7 +51,8 @@ ADVISED = 2  # changes that a text advises at most; result.json has all
 def fit_text(fit: Estimate, result: Findings) -> str:
     """Return parameters, scores on every part, residual tests and warnings.
 
-    Of a spec's fit the changes that were tried follow, and the verdict that its page begins with.
+    The verdict that its page begins with ends them; of a spec's fit after the changes that were
+    tried.
     """
     if not fit.status.ok:
         return ""
@@ -76,7 +77,8 @@ def fit_text(fit: Estimate, result: Findings) -> str:
         warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
     ]
     if isinstance(result, FitResult):
-        blocks += [_advice_lines(result), [verdict_line(fit_verdict(result))]]
+        blocks.append(_advice_lines(result))
+    blocks.append([verdict_line(fit_verdict(result))])
     return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
 
 
