@@ -63,6 +63,11 @@ class NewTerm:
     template: str | None = None
     scale: Expression | None = None
 
+    @property
+    def has_form(self) -> bool:
+        """True of all but a constant: another form might explain the learner as well."""
+        return self.text != "1"
+
 
 def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
     """Return a parameter's name for each kind of term, none of which is taken."""
@@ -99,7 +104,7 @@ def added_to_baseline(
             initial=one.coefficient,
             unit=one.unit or "",
             output=one.added_to if several else None,
-            selected=True,
+            selected=one.has_form,
         )
         for one in added
     ]
@@ -113,6 +118,7 @@ def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
         entries = {"parameter": one.name, "regressor": one.text, "initial": _short(one.coefficient)}
         entries |= {"unit": one.unit} if one.unit else {}
         entries |= {"output": one.added_to} if several else {}
+        entries |= {"selected": True} if one.has_form else {}
         blocks.append(
             "\n".join(
                 [
@@ -139,6 +145,7 @@ class ChangedMotion:
         for one in self.parameters:
             entries = {"initial": _short(one.initial)} | ({"unit": one.unit} if one.unit else {})
             entries |= {"min": one.min} if np.isfinite(one.min) else {}
+            entries |= {"selected": True} if one.selected else {}
             rows.append(
                 f"{one.name} = {{ "
                 f"{', '.join(f'{key} = {_toml(value)}' for key, value in entries.items())} }}"
@@ -185,7 +192,8 @@ def added_to_motion(
             texts[one.added_to] = f"({inside['inner']}{summand})/{inside['by']}"
         else:
             texts[one.added_to] = f"{text}{summand}"
-        new.append(PhysicalParameter(one.name, factor * coefficient, unit or "", selected=True))
+        found = one.name, factor * coefficient, unit or ""
+        new.append(PhysicalParameter(*found, selected=one.has_form))
     changed = Motion.from_equations(
         states=[replace(state, derivative=texts[state.name]) for state in motion.states],
         outputs=[replace(output, expression=texts[output.name]) for output in motion.outputs],
@@ -249,7 +257,8 @@ def _short(value: float) -> float:
 
 
 def _toml(value: object) -> str:
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else repr(value)
+    text = isinstance(value, str | bool)
+    return json.dumps(value, ensure_ascii=False) if text else repr(value)
 
 
 LEAST = 0.005
