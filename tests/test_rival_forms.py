@@ -108,7 +108,7 @@ def test_a_sharp_form_leaves_the_intervals_alone():
 
 def test_a_form_has_one_name():
     fit = fitted(heated("radiation", 3), "T[k-1]**3", selected=True)
-    names = [rival.name for rival in rival_forms(linearization_of(fit, Training()))]
+    names = [rival.name for rival in rival_forms(linearization_of(fit, Training()))[0]]
     assert len(names) == len(set(names))
     assert "T[k-1]**3.5" in names  # of what is never negative no sign is written
     assert not any("sign" in name for name in names if "**" in name)
@@ -180,3 +180,44 @@ def test_parameters_are_held_beside_a_form_that_data_have_selected(effect, recor
             missed += [not low <= true <= high for low, high in both]
     record_property("missed of 24", f"{missed[0]} by the form alone, {missed[1]} with its rivals")
     assert missed[1] <= 1
+
+
+def test_the_rows_of_forms_are_filtered_by_a_noise_model():
+    record = heated("radiation", 3)
+    terms = [oa.Term("a", "T[k-1]"), oa.Term("b", "P[k-1]"), oa.Term("c", "1")]
+    physics = oa.Baseline.from_terms([*terms, oa.Term("r", "T[k-1]**3", selected=True)])
+    fit = oa.estimate(record, physics, learner=None, noise=oa.ARMA(ar=1, ma=0))
+    _, with_forms = intervals(fit, "a")
+    plain = intervals(fitted(record, "T[k-1]**3", selected=True), "a")[1]
+    assert np.allclose(with_forms, plain, atol=0.5 * np.ptp(plain))
+
+
+def test_what_acts_in_two_equations_has_no_other_form():
+    """A force between two masses: what takes its place would have to act on both."""
+    rng = np.random.default_rng(0)
+    u, (x, z), rows = rng.normal(size=300), (0.0, 0.0), []
+    for k in range(300):
+        rows.append([x, z])
+        between = 0.2 * (x - z) ** 3
+        x, z = 0.8 * x + 0.3 * u[k] - between, 0.7 * z + between
+    y = np.array(rows) + 0.01 * rng.normal(size=(300, 2))
+    record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["p", "q"], sampling_time=1.0)
+    motion = oa.Motion.from_equations(
+        states=[
+            oa.State("x", "a*x + b*u - s*(x - z)**3", start="p"),
+            oa.State("z", "c*z + s*(x - z)**3", start="q"),
+        ],
+        outputs=[oa.Output("p", "x"), oa.Output("q", "z")],
+        inputs=["u"],
+        parameters=[
+            *(
+                oa.PhysicalParameter(name, value)
+                for name, value in (("a", 0.8), ("b", 0.3), ("c", 0.7))
+            ),
+            oa.PhysicalParameter("s", 0.2, selected=True),
+        ],
+        integrator="discrete",
+    )
+    found = oa.estimate(record, motion, learner=None).diagnose()
+    assert "untried_forms" in [warning.code for warning in found.warnings]
+    assert "no other can be tried" in found.verdict

@@ -32,11 +32,12 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
 
     None where a learner is beside the physics, and where no form was selected or has a rival.
     """
-    if terms.learned is not None or not any(p.selected for p in terms.fit.problem.parameters):
+    if terms.learned is not None:
         return None
-    rivals = rival_forms(terms)
+    rivals, untried = rival_forms(terms)
+    warnings = [untried_forms_warning(untried)] if untried else []
     if not rivals:
-        return None
+        return Budget((), 1.0, (), (), tuple(warnings)) if untried else None
     fit, value = terms.fit, terms.value
     moved = np.array([rival.moved for rival in rivals])
     forms = [OtherForm(rival.name, 1.0, rival.moved) for rival in rivals]
@@ -48,8 +49,21 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     rows = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
     physical, unbounded = physical_biases(terms, forms, every)
     rows, physical = (tuple(row for row in of if row.value) for of in (rows, physical))
-    warnings = [_warning(rivals, terms.names, value, moved, std), *unbounded]
-    return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
+    implied = _warning(rivals, terms.names, value, moved, std)
+    warnings += [*([implied] if implied else []), *unbounded]
+    return Budget((), 1.0, rows, physical, tuple(warnings))
+
+
+def untried_forms_warning(names: Sequence[str]) -> Warning:
+    """Return the warning that other forms of selected terms could not be tried."""
+    whose = f"the term{'s' if len(names) > 1 else ''} of {join_words(names)}"
+    return Warning(
+        "untried_forms",
+        f"the form of {whose} was selected from these data, and no other form can be tried. It has "
+        "no standard error, acts in several equations, or is beside a noise model of a motion. All "
+        "intervals hold for this form alone. Remedy: where the form is known from elsewhere, leave "
+        "out `selected`.",
+    )
 
 
 def _warning(

@@ -261,10 +261,12 @@ class LaggedTerms:
 
     def with_forms(self, forms: Sequence[Suspect]) -> RowEquations:
         """Return the least squares of θ and of further terms on the training rows."""
-        problem, every = self.problem, self._every
+        problem = self.problem
+        every = self._every if problem.noise is None else slice(None)  # its filter needs all rows
         x, weight = problem.rows.x[every], problem.weight.matrix
         terms = [self._sampled(form).values(x, problem.layout, problem.outputs) for form in forms]
         rows = np.concatenate([problem.phi(x), np.stack(terms, axis=-1)], axis=-1)
+        rows = rows if problem.noise is None else problem.noise.rows(rows)
         rows = np.einsum("oi,nik->nok", weight, rows).reshape(-1, rows.shape[-1])
         count = len(self.theta)
         basis = np.linalg.qr(rows[:, :count])[0]

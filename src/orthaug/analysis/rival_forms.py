@@ -152,32 +152,48 @@ class RivalForm:
         return close and bool(apart <= _SAME * np.linalg.norm(self.moved))
 
 
-def rival_forms(terms: SelectedTerms) -> list[RivalForm]:
+def selected_terms(fit: Any) -> list[str]:
+    """Return the coefficients of the terms whose forms were selected."""
+    return [parameter.name for parameter in fit.problem.parameters if parameter.selected]
+
+
+def rival_forms(terms: SelectedTerms) -> tuple[list[RivalForm], list[str]]:
     """Return the forms that fit as well as those that were selected, the best first.
 
-    Empty without a selected term, and where the coefficient has no standard error.
+    With the coefficients of terms in whose place no other form can be tried: they have no standard
+    error, or act in several equations.
     """
     found: list[RivalForm] = []
-    for place, parameter in enumerate(terms.fit.problem.parameters):
+    untried: list[str] = []
+    for name in selected_terms(terms.fit):
+        place = terms.fit.problem.names.index(name)
         std = terms.fit.known_std[place]
-        if parameter.selected and terms.value[place] != 0 and std > 0:
-            found += _rivals_of(terms, place, float(abs(terms.value[place]) / std))
+        known = terms.value[place] != 0 and std > 0
+        t = float(abs(terms.value[place]) / std) if known else 0.0
+        rivals = _rivals_of(terms, place, t) if known else None
+        untried += [name] if rivals is None else []
+        found += rivals or []
     found.sort(key=lambda rival: rival.rise)
-    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))]
+    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))], untried
 
 
-def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
-    """Return the rivals of one term, whose coefficient is `t` standard errors large."""
+def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm] | None:
+    """Return the rivals of one term, whose coefficient is `t` standard errors large.
+
+    None where no other form can be tried.
+    """
     # A form that differs by what noise hides in the fit's equations may differ by more at points
     least = 1 - max(_UNLIKE, min(4 * AS_LIKELY / t**2, _MOST_UNLIKE))
     forms = terms.forms(place)
-    likely = [] if forms is None else forms.most_alike(least)
+    if forms is None:
+        return None
+    likely = forms.most_alike(least)
     equations = terms.with_forms(likely) if likely else None
     if equations is None:
         return []
     information, gradient, count = equations.information, equations.gradient, len(terms.value)
     if not np.isfinite(information).all() or not np.isfinite(gradient).all():
-        return []
+        return None
     others = equations.fitted.copy()
     others[:count] &= ~terms.shapes(place)
     others[place] = False
@@ -186,7 +202,7 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
         information[np.ix_(others, others)], across
     )
     if not own > 0:
-        return []
+        return None
     slope = terms.slopes[place]
     gone = -terms.value[place] / slope
     found = []

@@ -407,6 +407,7 @@ _DEFECTS = (
 )
 _UNTESTED = {
     "explains_nothing": "its free run explains nothing of an output",
+    "untried_forms": "a form was selected from the data, and no other can be tried",
     "quantised_output": "the steps of an output move its parameters",
     "little_left": "a parameter rests on little of its regressor beside the learner",
     "output_without_learner": "an output has parameters of a learned equation, but no learner",
