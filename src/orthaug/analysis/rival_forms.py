@@ -8,10 +8,11 @@ the term's coefficient p falls to 0, `δ_p = −p̂`, and all others follow,
 
     δ = A⁻¹(g − A_p δ_p),    while the squares rise by  A_pp δ_p² − 2 g_p δ_p − (g − A_p δ_p)ᵀδ.
 
-A form that rises them by no more than 12 variances of the errors over the best may be the true one:
-as for causes of a learner (`bias_hull`). The change of the equations is small for such a form,
-whatever the size of the term, so that the first order is enough. The interval of a parameter is the
-hull over them (`form_budget`).
+A form that raises them by no more than 12 variances of the errors over the best may be the true
+one, as for causes of a learner (`bias_hull`); by more where some form beside the term lowers them,
+since then the term itself is not. The change of the equations is small for such a form, whatever
+the size of the term, so that the first order is enough. The interval of a parameter is the hull
+over them (`form_budget`).
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
-from orthaug.analysis.bias_hull import AS_LIKELY
+from orthaug.analysis.bias_hull import AS_LIKELY, LEAST
 from orthaug.analysis.free_run_equations import solve_scaled
 
 _MOST_FORMS = 24  # tried in the fit's equations: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
 _SAME = 1e-3  # of what two forms do: they are one by two names
 _SPANNED = 1e-10  # of a term's squares: what is left of one that others express
+_BY_CHANCE = 9.0  # variances by which some form lowers the squares of a term that is true
 _PLAIN = 0.3  # times the size of a term beside the physics: what leaves less of a form is physics
 _UNLIKE = 0.1  # of a term's squares beside the physics: a form that leaves no more is tried
 _MOST_UNLIKE = 0.5  # one that leaves more is not, whatever the noise
@@ -102,8 +104,13 @@ class SelectedTerms(Protocol):
         ...
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters."""
+        ...
+
+    @property
     def value(self) -> Vector:
-        """The parameters (nθ,)."""
+        """Their values (nθ,)."""
         ...
 
     @property
@@ -203,20 +210,28 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm] | 
     )
     if not own > 0:
         return None
-    slope = terms.slopes[place]
-    gone = -terms.value[place] / slope
-    found = []
+    gone = -terms.value[place] / terms.slopes[place]
+    variance = own * gone**2 / t**2
+
+    def moved_by(free: Bool[np.ndarray, "n"], pull: Vector) -> tuple[Vector, float]:
+        """Return the step (n,) of some unknowns, and by how much the squares fall with it."""
+        step = np.zeros(len(free))
+        step[free] = solve_scaled(information[np.ix_(free, free)], pull[free])
+        return step, float(pull @ step)
+
+    left = information[place, place] * gone**2 - 2 * gradient[place] * gone
+    found, lacks = [], 0.0
     for k, form in enumerate(likely):
         free = others.copy()
         free[count + k] = True
-        pull = gradient[free] - information[free, place] * gone
-        step = solve_scaled(information[np.ix_(free, free)], pull)
-        rise = information[place, place] * gone**2 - 2 * gradient[place] * gone - pull @ step
-        moved = np.zeros(len(free))
-        moved[free] = step
-        shift = -(terms.slopes * moved[:count])
+        step, falls = moved_by(free, gradient - information[:, place] * gone)
+        shift = -(terms.slopes * step[:count])
         shift[place] = 0.0  # its coefficient is none of another form
-        name = terms.fit.problem.names[place]
-        found.append(RivalForm(name, form, float(rise / (own * gone**2) * t**2), shift))
+        found.append(RivalForm(terms.names[place], form, (left - falls) / variance, shift))
+        free[place] = True
+        lacks = max(lacks, moved_by(free, gradient)[1] / variance)
     best = min(0.0, *(rival.rise for rival in found))
-    return [rival for rival in found if rival.rise - best <= AS_LIKELY]
+    # No form may be the true one: what the best lacks, another may lack as well
+    most = AS_LIKELY * (1 + max(lacks - _BY_CHANCE, 0.0))
+    most = max(AS_LIKELY, min(most, (1 - LEAST) * t**2))
+    return [rival for rival in found if rival.rise - best <= most]
