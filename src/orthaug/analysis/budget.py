@@ -492,7 +492,8 @@ def _as_physics(causes: Causes, memory: Sequence[str]) -> tuple[str, ...]:
     read = [name for name in memory if re.search(rf"\b{re.escape(name)}\b", named)]
     if read:
         return (f"let `orthaug explain` write {named} into the physics, with {join_words(read)}",)
-    return (f"write {named} into the physics with a coefficient as parameter",)
+    formed = ", `selected = true`" if any(one.expression != "1" for one in suspects) else ""
+    return (f"write {named} into the physics with a coefficient as parameter{formed}",)
 
 
 def _describe_cause(entry: SuspectedBias) -> str:
