@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug.analysis.findings import BiasResult
+from orthaug.analysis.fit_findings import ParameterResult
 from orthaug.analysis.form_budget import budget_by_forms
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.measure_bias import linearization_of
 from orthaug.analysis.rival_forms import rival_forms
 from orthaug.inference.measures import Training
+from orthaug.reports.biases import size_of_bias
+from orthaug.reports.page_verdict import fit_verdict
 
 TRUE = {"a": 0.93, "b": 0.3}
 # Effects that the physics lacks, each with whether its variable changes its sign; most are in no catalogue
@@ -117,6 +121,77 @@ def test_a_form_has_one_name():
 def test_the_coefficient_itself_is_of_its_form():
     budget = budget_of(fitted(heated("radiation", 3), "T[k-1]**3", selected=True))
     assert budget.of("r") is None
+
+
+def cell(seed=2, samples=600):
+    """The voltage of a cell: an ohmic drop, and one that grows with the logarithm of the current."""
+    rng = np.random.default_rng(seed)
+    current = np.repeat(rng.uniform(2, 60, samples // 15 + 1), 15)[:samples]
+    voltage = np.full(samples, 0.75)
+    for k in range(1, samples):
+        steady = 0.95 - 0.0035 * current[k - 1] - 0.035 * np.log(current[k - 1])
+        voltage[k] = 0.88 * voltage[k - 1] + 0.12 * steady + 0.0008 * rng.normal()
+    return oa.Record.from_arrays(current, voltage, inputs=["I"], outputs=["U"], sampling_time=0.5)
+
+
+def fitted_cell():
+    terms = [oa.Term("a", "U[k-1]"), oa.Term("r", "-I[k-1]"), oa.Term("u0", "1")]
+    peak = oa.Term("p", "exp(-I[k-1]/16)", selected=True)
+    return oa.estimate(cell(), oa.Baseline.from_terms([*terms, peak]), learner=None)
+
+
+def test_a_logarithm_is_a_form_of_what_is_positive():
+    fit = fitted_cell()
+    assert "log(I[k-1])" in [rival.name for rival in rival_forms(linearization_of(fit, Training()))]
+    own, with_forms = intervals(fit, "u0")
+    assert not own[0] <= 0.12 * 0.95 <= own[1]
+    assert with_forms[0] <= 0.12 * 0.95 <= with_forms[1]
+
+
+CELL = """
+[data]
+sampling_time = 0.5
+inputs = ["I"]
+outputs = ["U"]
+train = { files = ["run.csv"] }
+[learner]
+kind = "none"
+[[baseline.terms]]
+parameter = "a"
+regressor = "U[k-1]"
+[[baseline.terms]]
+parameter = "r"
+regressor = "-I[k-1]"
+[[baseline.terms]]
+parameter = "u0"
+regressor = "1"
+[[baseline.terms]]
+parameter = "p"
+regressor = "exp(-I[k-1]/16)"
+selected = true
+"""
+
+
+def test_the_coefficient_of_a_form_that_others_could_replace_is_not_read_as_physics(tmp_path):
+    (experiment,) = cell().experiments
+    rows = np.column_stack([experiment.inputs, experiment.outputs])
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header="I,U", comments="")
+    (tmp_path / "spec.toml").write_text(CELL)
+    result = oa.fit_spec(str(tmp_path / "spec.toml")).result
+    assert [row.name for row in result.parameters if row.selected] == ["p"]
+    verdict = fit_verdict(result)
+    assert "and p hang on the form of a term that was selected" in verdict.trust
+    assert "and to read a as physics. r, u0 and p are too" in verdict.use
+
+
+def test_a_bias_beside_a_value_that_may_be_zero_is_in_no_per_cent():
+    row = ParameterResult(name="c", unit="", initial=0, value=-20.0, std=107.0)
+    biased = BiasResult(value=-2.2e4, cause="T**2", share=None)
+    assert row.model_copy(update={"bias": biased}).share_of_bias is None
+    sure = row.model_copy(update={"bias": biased, "std": 0.1})
+    assert sure.share_of_bias == pytest.approx(1100)
+    assert size_of_bias([sure]) == " by about +110000 %, 220000 times its standard error"
+    assert "%" not in size_of_bias([row.model_copy(update={"bias": biased})])
 
 
 def moved_mass(seed, samples=500, step=0.05):

@@ -61,6 +61,8 @@ class Family(NamedTuple):
     scaled: bool = True
     level: Callable[[str, str], str] | None = None
     """Writes one that acts on what is never negative, where that is shorter."""
+    positive: bool = False
+    """True if it acts only on what is positive."""
 
     def expression(self, on: str, width: str, *, level: bool = False) -> str:
         """Return the member of a width, or power, that acts on an expression."""
@@ -90,6 +92,7 @@ RIVALS = (
     Family("power", _odd_power, (*_POWERS, 3.5, 4.0, 5.0), False, lambda x, w: f"{x}**{w}"),
     Family("exp", lambda x, w: f"exp({x}/{w})", (0.5, 1.0, 2.0)),
     Family("decay", lambda x, w: f"exp(-{x}/{w})", (0.5, 1.0, 2.0)),
+    Family("log", lambda x, w: f"log({x})", (1.0,), scaled=False, positive=True),
 )
 """What may take the place of a term whose form was selected: a radiation is no cubic."""
 SMOOTH_FRICTION = {family.name: family for family in FAMILIES if family.name in ("tanh", "atan")}
@@ -257,7 +260,10 @@ def family_members(
     if not np.any(size > 0):
         return
     median = float(np.median(size[size > 0]))
+    positive = bool(np.min(values, initial=np.inf) > 0)
     for family in families:
+        if family.positive and not positive:
+            continue
         for member in family.members:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
             text = family.expression(on, w, level=bool(np.min(values, initial=0.0) >= 0))

@@ -13,6 +13,7 @@ from orthaug._base.lines import first_words, join_words
 from orthaug.analysis.bias_hull import AS_LIKELY, OtherForm, hull
 from orthaug.analysis.budget import Budget, BudgetTerms
 from orthaug.analysis.parameter_bias import (
+    ParameterBias,
     farthest,
     owners_of,
     parameter_biases,
@@ -21,6 +22,7 @@ from orthaug.analysis.parameter_bias import (
 from orthaug.analysis.rival_forms import RivalForm, SelectedTerms, rival_forms
 
 _LISTED = 3  # forms and parameters that a warning lists at most
+_ROUNDING = 1e-6  # of a standard error
 
 
 class FormTerms(BudgetTerms, SelectedTerms, Protocol):
@@ -47,9 +49,14 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     owners = owners_of(forms, moved)
     rows = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
     physical, unbounded = physical_biases(terms, forms, every)
-    rows, physical = (tuple(row for row in of if row.value) for of in (rows, physical))
+    rows, physical = (tuple(filter(_is_moved, of)) for of in (rows, physical))
     warnings = [_warning(rivals, terms.names, value, moved, std), *unbounded]
     return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
+
+
+def _is_moved(row: ParameterBias) -> bool:
+    """Return whether a bias is more than rounding."""
+    return abs(row.value) > 0 and (row.errors is None or row.errors > _ROUNDING)
 
 
 def _warning(
@@ -75,9 +82,14 @@ def _warning(
     first = f" {rivals[0].name} fits clearly better." if rivals[0].rise < -AS_LIKELY else ""
     return Warning(
         "rival_forms",
-        f"the form of {whose} was selected from these data, and {first_words(forms, _LISTED)} "
+        f"the form of {whose} was selected from these data, and {_some(forms)} "
         f"fit{'s' if len(forms) == 1 else ''} as well: with these forms {join_words(reach)}. The "
         "standard errors hold for the selected form alone, the intervals with the bias for all of "
         f"these.{first} Remedy: data over a wider range. Where the form is known from elsewhere, "
         "leave out `selected`.",
     )
+
+
+def _some(forms: Sequence[str]) -> str:
+    """Return the first forms in words, and how many more there are."""
+    return first_words(forms, _LISTED) if len(forms) > _LISTED else join_words(forms)

@@ -32,6 +32,7 @@ _MOST_FORMS = 24  # tried in the fit's equations: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
 _SAME = 1e-3  # of what two forms do: they are one by two names
 _SPANNED = 1e-10  # of a term's squares: what is left of one that others express
+_CONSTANT = 1e-6  # of a constant: what is left of it beside physics that has one
 _PLAIN = 0.3  # times the size of a term beside the physics: what leaves less of a form is physics
 _UNLIKE = 0.1  # of a term's squares beside the physics: a form that leaves no more is tried
 _MOST_UNLIKE = 0.5  # one that leaves more is not, whatever the noise
@@ -65,10 +66,14 @@ class Forms(NamedTuple, Generic[T]):
         basis = np.linalg.qr(self.slopes[there] / np.where(size > 0, size, 1.0))[0]
         term, others = own - basis @ (basis.T @ own), values - basis @ (basis.T @ values)
         whole, squares = float(term @ term), np.sum(others**2, axis=0)
-        beside = whole / max(float(own @ own), np.finfo(float).tiny)
-        if not beside > _SPANNED:
+        if not whole > _SPANNED * float(own @ own):
             return []
-        # What is nearly the physics itself fits anything with a huge size
+        # What is nearly the physics itself fits anything with a huge size. Where the physics has a
+        # constant, a form's own is none of it: log(I) counts from a unit of I
+        level = np.ones(len(own)) / np.sqrt(len(own))
+        if np.linalg.norm(level - basis @ (basis.T @ level)) < _CONSTANT:
+            own, values = own - own.mean(), values - values.mean(axis=0)
+        beside = whole / max(float(own @ own), np.finfo(float).tiny)
         usable &= squares > _PLAIN**2 * beside * np.sum(values**2, axis=0)
         shares = np.where(usable, (term @ others) ** 2 / np.where(usable, squares, 1.0), 0.0)
         order = np.argsort(-shares, kind="stable")

@@ -371,7 +371,8 @@ def _bias_table(rows: Sequence[ParameterResult]) -> list[str]:
         value, bias = row.value or 0.0, row.bias.value if row.bias else None
         bias = _round_share((bias or 0.0) / (value or 1.0)) * (value or 1.0)
         errors = plain_number(abs(bias) / row.std) if row.std else "–"
-        part = percent(_round_share(bias / value), sign="+") if value else "–"
+        share = row.share_of_bias
+        part = "–" if share is None else percent(_round_share(share), sign="+")
         known = row.bias is None or row.bias.determined
         cells.append(
             [
