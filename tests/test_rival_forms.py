@@ -242,6 +242,98 @@ def test_a_width_goes_with_its_term():
     assert terms.shapes(names.index("s")).tolist() == [name == "w" for name in names]
 
 
+def stepped(rng, low, high, hold, samples):
+    return np.repeat(rng.uniform(low, high, samples // hold + 1), hold)[:samples]
+
+
+def test_forms_of_a_difference_of_lags_are_tried():
+    """Friction acts on a velocity, which lagged physics has as a difference."""
+    rng = np.random.default_rng(0)
+    u, y = stepped(rng, -1, 1, 9, 900), np.zeros(900)
+    for k in range(2, 900):
+        turned = np.tanh((y[k - 1] - y[k - 2]) / 0.04)
+        y[k] = 1.8 * y[k - 1] - 0.83 * y[k - 2] + 0.05 * u[k - 1] - 0.03 * turned
+        y[k] += 0.0015 * rng.normal()
+    record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["y"], sampling_time=0.1)
+    terms = [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
+    jump = oa.Term("s", "sign(y[k-1] - y[k-2])", selected=True)
+    fit = oa.estimate(record, oa.Baseline.from_terms([*terms, jump]), learner=None)
+    own, with_forms = intervals(fit, "a1")
+    assert not own[0] <= 1.8 <= own[1]
+    assert with_forms[0] <= 1.8 <= with_forms[1]
+    assert "atan((y[k-1] - y[k-2])/" in budget_of(fit).warnings[0].text
+
+
+def test_a_form_that_does_something_else_counts_where_it_fits_clearly_better():
+    rng = np.random.default_rng(0)
+    u, q = stepped(rng, 0.2, 1, 9, 900), stepped(rng, 0.2, 1, 13, 900)
+    y = np.zeros(900)
+    for k in range(1, 900):
+        y[k] = 0.9 * y[k - 1] + 0.4 * u[k - 1] - 0.09 * q[k - 1] * y[k - 1] ** 2
+        y[k] += 0.01 * rng.normal()
+    inputs = {"inputs": ["u", "q"], "outputs": ["y"], "sampling_time": 0.1}
+    record = oa.Record.from_arrays(np.column_stack([u, q]), y, **inputs)
+    terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")]
+    product = oa.Term("s", "q[k-1]*y[k-1]", selected=True)
+    fit = oa.estimate(record, oa.Baseline.from_terms([*terms, product]), learner=None)
+    own, with_forms = intervals(fit, "a")
+    assert not own[0] <= 0.9 <= own[1]
+    assert with_forms[0] <= 0.9 <= with_forms[1]
+    assert "q[k-1]*y[k-1]**2 fits clearly better" in budget_of(fit).warnings[0].text
+
+
+def test_a_term_of_two_outputs_has_other_forms_in_both():
+    rng = np.random.default_rng(0)
+    u, y = stepped(rng, 20, 330, 25, 600), np.full((600, 2), 700.0)
+    for k in range(1, 600):
+        lost = 2e-12 * (y[k - 1, 0] + 273) ** 4
+        y[k] = np.array([0.93, 0.9]) * y[k - 1] + 0.3 * u[k - 1] + np.array([-lost, lost])
+        y[k] += 0.5 * rng.normal(size=2)
+    record = oa.Record.from_arrays(u, y, inputs=["P"], outputs=["T", "S"], sampling_time=1.0)
+    terms = [
+        *(oa.Term(f"a{o}", f"{o}[k-1]", output=o) for o in "TS"),
+        *(oa.Term(f"b{o}", "P[k-1]", output=o) for o in "TS"),
+        *(oa.Term(f"c{o}", "1", output=o) for o in "TS"),
+        oa.Term("r", "T[k-1]**3", output="T", selected=True),
+        oa.Term("r", "-T[k-1]**3", output="S"),
+    ]
+    fit = oa.estimate(record, oa.Baseline.from_terms(terms), learner=None)
+    for name, true in (("aT", 0.93), ("aS", 0.9)):
+        own, with_forms = intervals(fit, name)
+        assert not own[0] <= true <= own[1]
+        assert with_forms[0] <= true <= with_forms[1]
+
+
+def test_a_form_has_the_factor_that_the_term_has_in_its_equation():
+    rng = np.random.default_rng(0)
+    length, u = stepped(rng, 0.5, 2, 12, 400), stepped(rng, -3, 3, 17, 400)
+    v, rows = 0.0, []
+    for k in range(400):
+        rows.append(v)
+        for _ in range(10):
+            v += 0.005 * (2 * u[k] - 0.8 * v - 0.5 * v * abs(v)) / length[k]
+    y = np.array(rows) + 0.01 * rng.normal(size=400)
+    inputs = {"inputs": ["u", "L"], "outputs": ["y"], "sampling_time": 0.05}
+    record = oa.Record.from_arrays(np.column_stack([u, length]), y, **inputs)
+    motion = oa.Motion.from_equations(
+        states=[oa.State("v", "(b*u - c*v - s*v**3)/L")],
+        outputs=[oa.Output("y", "v")],
+        inputs=["u", "L"],
+        parameters=[
+            oa.PhysicalParameter("b", 2.0),
+            oa.PhysicalParameter("c", 0.8),
+            oa.PhysicalParameter("s", 0.3, selected=True),
+        ],
+    )
+    fit = oa.estimate(record, motion, learner=None)
+    c = fit.problem.names.index("c")
+    assert not fit.interval[c, 0] <= 0.8 <= fit.interval[c, 1]
+    budget = budget_by_forms(linearize_fit(fit))
+    low, high = budget.of("c").ci95 or (-np.inf, np.inf)
+    assert low <= 0.8 <= high
+    assert "v*abs(v)" in budget.warnings[0].text
+
+
 @pytest.mark.proof
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_parameters_are_held_beside_a_form_that_data_have_selected(effect, record_property):

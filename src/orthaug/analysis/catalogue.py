@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -234,6 +235,16 @@ class Catalogue:
             self.of_text(text, None, place, f"{text}{self._label(place)}")
             for place in self.places
             for text in self.products
+        )
+
+    def products_of(self, names: Sequence[str]) -> tuple[Any, ...]:
+        """Return products of two of these names, each linear or one squared; none of many names."""
+        pairs = list(combinations(names, 2)) if len(names) <= _MULTIPLIED else []
+        texts = [text for a, b in pairs for text in (f"{a}*{b}", f"{a}**2*{b}", f"{a}*{b}**2")]
+        return tuple(
+            self.of_text(text, None, place, f"{text}{self._label(place)}")
+            for place in self.places
+            for text in texts
         )
 
     def families(self, families: Sequence[Family] = FAMILIES) -> tuple[Any, ...]:

@@ -9,9 +9,10 @@ the term's coefficient p falls to 0, `δ_p = −p̂`, and all others follow,
     δ = A⁻¹(g − A_p δ_p),    while the squares rise by  A_pp δ_p² − 2 g_p δ_p − (g − A_p δ_p)ᵀδ.
 
 A form that rises them by no more than 12 variances of the errors over the best may be the true one:
-as for causes of a learner (`bias_hull`). The change of the equations is small for such a form,
-whatever the size of the term, so that the first order is enough. The interval of a parameter is the
-hull over them (`form_budget`).
+as for causes of a learner (`bias_hull`). Of motions those are tried that do nearly what the term
+does: their change of the equations is small, whatever the size of the term, so that the first order
+is enough. Of lagged physics others count, too, where they fit clearly better. The interval of a
+parameter is the hull over them (`form_budget`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias_hull import AS_LIKELY
 from orthaug.analysis.free_run_equations import solve_scaled
 
-_MOST_FORMS = 24  # tried in the fit's equations: those that are most alike
+_MOST_FORMS = 24  # tried in equations of first order: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
 _SAME = 1e-3  # of what two forms do: they are one by two names
 _SPANNED = 1e-10  # of a term's squares: what is left of one that others express
@@ -50,13 +51,18 @@ class Forms(NamedTuple, Generic[T]):
     """Of the equation by the other parameters."""
     own: Float[np.ndarray, "m"]
     """The term for a coefficient of 1."""
+    linear: bool
+    """True if the fit's equations are exact for any form: what fits clearly better counts then."""
 
-    def most_alike(self, least: float) -> list[T]:
-        """Return the forms that explain a term beside the physics, the best first.
+    def most_alike(self, least: float) -> list[tuple[T, bool]]:
+        """Return the forms that may take a term's place, the most alike first.
+
+        With each is whether it does nearly what the term does beside the physics.
 
         Args:
-            least: share of it that a form explains at least.
+            least: share of that which such a form explains at least.
         """
+        lowest = 0.0 if self.linear else least
         with np.errstate(all="ignore"):
             there = np.isfinite(self.slopes).all(axis=1) & np.isfinite(self.own)
         values, own = self.values[there], self.own[there]
@@ -79,8 +85,10 @@ class Forms(NamedTuple, Generic[T]):
         order = np.argsort(-shares, kind="stable")
         # What explains all of it is the term itself, by another name
         return [
-            self.forms[k] for k in order if least * whole <= shares[k] <= (1 - _SPANNED) * whole
-        ][:_MOST_FORMS]
+            (self.forms[k], bool(shares[k] >= least * whole))
+            for k in order
+            if lowest * whole <= shares[k] <= (1 - _SPANNED) * whole and usable[k]
+        ][: None if self.linear else _MOST_FORMS]
 
 
 class FormEquations(Protocol):
@@ -124,8 +132,8 @@ class SelectedTerms(Protocol):
         """
         ...
 
-    def with_forms(self, forms: Sequence[Any]) -> FormEquations | None:
-        """Return the fit's normal equations with further terms; None where there are none."""
+    def with_forms(self, selected: int, forms: Sequence[Any]) -> FormEquations | None:
+        """Return the fit's normal equations with further forms of a term; None without any."""
         ...
 
     def shapes(self, selected: int) -> Bool[np.ndarray, "nt"]:
@@ -177,7 +185,7 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
     least = 1 - max(_UNLIKE, min(4 * AS_LIKELY / t**2, _MOST_UNLIKE))
     forms = terms.forms(place)
     likely = [] if forms is None else forms.most_alike(least)
-    equations = terms.with_forms(likely) if likely else None
+    equations = terms.with_forms(place, [form for form, _ in likely]) if likely else None
     if equations is None:
         return []
     information, gradient, count = equations.information, equations.gradient, len(terms.value)
@@ -195,7 +203,7 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
     slope = terms.slopes[place]
     gone = -terms.value[place] / slope
     found = []
-    for k, form in enumerate(likely):
+    for k, (form, alike) in enumerate(likely):
         free = others.copy()
         free[count + k] = True
         pull = gradient[free] - information[free, place] * gone
@@ -206,6 +214,8 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
         shift = -(terms.slopes * moved[:count])
         shift[place] = 0.0  # its coefficient is none of another form
         name = terms.fit.problem.names[place]
-        found.append(RivalForm(name, form, float(rise / (own * gone**2) * t**2), shift))
+        rise = float(rise / (own * gone**2) * t**2)
+        if alike or rise < -AS_LIKELY:
+            found.append(RivalForm(name, form, rise, shift))
     best = min(0.0, *(rival.rise for rival in found))
     return [rival for rival in found if rival.rise - best <= AS_LIKELY]
