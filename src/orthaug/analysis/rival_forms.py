@@ -39,7 +39,14 @@ _UNLIKE = 0.1  # of a term's squares beside the physics: a form that leaves no m
 _MOST_UNLIKE = 0.5  # one that leaves more is not, whatever the noise
 
 
-T = TypeVar("T")
+class Written(Protocol):
+    """A form with its expression."""
+
+    @property
+    def expression(self) -> str: ...
+
+
+T = TypeVar("T", bound=Written)
 
 
 class Forms(NamedTuple, Generic[T]):
@@ -74,13 +81,14 @@ class Forms(NamedTuple, Generic[T]):
         whole, squares = float(term @ term), np.sum(others**2, axis=0)
         if not whole > _SPANNED * float(own @ own):
             return []
-        # What is nearly the physics itself fits anything with a huge size. Where the physics has a
-        # constant, a form's own is none of it: log(I) counts from a unit of I
-        level = np.ones(len(own)) / np.sqrt(len(own))
+        # What is nearly the physics itself fits anything with a huge size. A constant beside log(I)
+        # does not make it so: that counts from a unit of I
+        sizes, level = np.sum(values**2, axis=0), np.ones(len(own)) / np.sqrt(len(own))
         if np.linalg.norm(level - basis @ (basis.T @ level)) < _CONSTANT:
-            own, values = own - own.mean(), values - values.mean(axis=0)
+            by_unit = np.array([form.expression.startswith("log(") for form in self.forms])
+            sizes = np.where(by_unit, sizes - (level @ values) ** 2, sizes)
         beside = whole / max(float(own @ own), np.finfo(float).tiny)
-        usable &= squares > _PLAIN**2 * beside * np.sum(values**2, axis=0)
+        usable &= squares > _PLAIN**2 * beside * sizes
         shares = np.where(usable, (term @ others) ** 2 / np.where(usable, squares, 1.0), 0.0)
         order = np.argsort(-shares, kind="stable")
         # What explains all of it is the term itself, by another name
