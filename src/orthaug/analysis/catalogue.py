@@ -88,8 +88,13 @@ FAMILIES = (
 )
 
 
+_OF_LEVELS: dict[str, Callable[[str, str], str]] = {
+    "stribeck": lambda x, w: f"exp(-{x}/{w})",
+    "dead_zone": lambda x, w: f"max({x} - {w}, 0)",
+    "saturation": lambda x, w: f"min({x}, {w})",
+}
 RIVALS = (
-    *(family for family in FAMILIES if family.name != "power"),
+    *(one._replace(level=_OF_LEVELS.get(one.name)) for one in FAMILIES if one.name != "power"),
     Family("power", _odd_power, (*_POWERS, 3.5, 4.0, 5.0), False, lambda x, w: f"{x}**{w}"),
     Family("exp", lambda x, w: f"exp({x}/{w})", (0.5, 1.0, 2.0)),
     Family("decay", lambda x, w: f"exp(-{x}/{w})", (0.5, 1.0, 2.0)),
