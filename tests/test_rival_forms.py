@@ -304,6 +304,26 @@ def test_a_term_of_two_outputs_has_other_forms_in_both():
         assert with_forms[0] <= true <= with_forms[1]
 
 
+def test_where_no_other_form_can_be_tried_a_warning_says_so():
+    """Between two masses a spring acts in both equations."""
+    motion = oa.Motion.from_equations(
+        states=[
+            *(oa.State("x", "v"), oa.State("z", "w")),
+            oa.State("v", "u - 4*x - v - s*(x - z)**3"),
+            oa.State("w", "s*(x - z)**3 - 3*z - w"),
+        ],
+        outputs=[oa.Output("y", "x")],
+        inputs=["u"],
+        parameters=[oa.PhysicalParameter("s", 0.3, selected=True)],
+    )
+    fit = oa.estimate(moved_mass(0, samples=150), motion, learner=None)
+    budget = budget_by_forms(linearize_fit(fit))
+    assert budget.parameters == ()
+    (warning,) = budget.warnings
+    assert warning.code == "rival_forms"
+    assert "No other form was tried, because it acts in several equations" in warning.text
+
+
 def test_a_form_has_the_factor_that_the_term_has_in_its_equation():
     rng = np.random.default_rng(0)
     length, u = stepped(rng, 0.5, 2, 12, 400), stepped(rng, -3, 3, 17, 400)

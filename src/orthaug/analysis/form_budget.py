@@ -32,13 +32,14 @@ class FormTerms(BudgetTerms, SelectedTerms, Protocol):
 def budget_by_forms(terms: FormTerms) -> Budget | None:
     """Return the bias of every parameter by the forms that fit as well as the selected ones.
 
-    None where a learner is beside the physics, and where no form was selected or has a rival.
+    None where a learner is beside the physics, and where no form was selected or has a rival. A
+    warning names the terms of which no other form can be tried.
     """
     if terms.learned is not None or not any(p.selected for p in terms.fit.problem.parameters):
         return None
-    rivals = rival_forms(terms)
+    rivals, alone = rival_forms(terms), _untried(terms)
     if not rivals:
-        return None
+        return Budget((), 1.0, (), (), (alone,)) if alone else None
     fit, value = terms.fit, terms.value
     moved = np.array([rival.moved for rival in rivals])
     forms = [OtherForm(rival.name, 1.0, rival.moved) for rival in rivals]
@@ -50,8 +51,27 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     rows = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
     physical, unbounded = physical_biases(terms, forms, every)
     rows, physical = (tuple(filter(_is_moved, of)) for of in (rows, physical))
-    warnings = [_warning(rivals, terms.names, value, moved, std), *unbounded]
+    warnings = [_warning(rivals, terms.names, value, moved, std), alone, *unbounded]
     return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
+
+
+def _untried(terms: FormTerms) -> Warning | None:
+    """Return the warning that names selected terms of which no other form can be tried."""
+    fit = terms.fit
+    found = [
+        parameter.name
+        for place, parameter in enumerate(fit.problem.parameters)
+        if parameter.selected and fit.known_std[place] > 0 and terms.forms(place) is None
+    ]
+    if not found:
+        return None
+    return Warning(
+        "rival_forms",
+        f"the form of the term{'s' if len(found) > 1 else ''} of {join_words(found)} was selected "
+        "from these data. No other form was tried, because it acts in several equations or is a "
+        "function. All intervals hold for this form alone. Remedy: fit other forms of it, too, and "
+        "compare the parameters. Where the form is known from elsewhere, leave out `selected`.",
+    )
 
 
 def _is_moved(row: ParameterBias) -> bool:

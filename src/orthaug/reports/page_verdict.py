@@ -314,11 +314,11 @@ def _doubts(result: FitResult | RowResult, data: DataResult) -> Iterator[str]:
             "part of its free run"
         )
     formed = [row for row in hang_on_form(_rows(result)) if is_biased(row)]
-    if formed:
+    if formed or of_selected_form(result):
         names = list(dict.fromkeys([row.name for row in formed] + of_selected_form(result)))
         yield (
             f"{join_words(names)} hang{'s' if len(names) == 1 else ''} on the form of a term that "
-            f"was selected from the data{size_of_bias(formed)}"
+            f"was selected from the data{size_of_bias(formed) if formed else ''}"
         )
     biased = [row.name for row in _rows(result) if is_biased(row) and row not in formed]
     if biased:
@@ -429,6 +429,7 @@ def _use_text(result: FitResult, level: str) -> str:
     rows, other = _rows(result), [*_moved_by_integrator(result), *of_selected_form(result)]
     sure = [row.name for row in rows if _is_known(row) and row.name not in other]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
+    untested = untested or (bool(of_selected_form(result)) and not hang_on_form(rows))
     doubted = untested or is_biased_by_feedback(result) or _may_lack_terms(result)
     imitable = getattr(result, "shared", None)  # of results of older versions there is none
     unclear = imitable.withdrawn or [] if imitable is not None else []
