@@ -184,6 +184,16 @@ def test_the_coefficient_of_a_form_that_others_could_replace_is_not_read_as_phys
     assert "and to read a as physics. r, u0 and p are too" in verdict.use
 
 
+def test_beside_a_learner_a_selected_form_is_alone():
+    terms = [oa.Term("a", "T[k-1]"), oa.Term("r", "T[k-1]**3", selected=True)]
+    learner = oa.MLP(hidden=(2,), inputs=("P[k-1]",))
+    fit = oa.estimate(heated("radiation", 3, 300), oa.Baseline.from_terms(terms), learner=learner)
+    result = fit.diagnose()
+    (warning,) = (one for one in result.warnings if one.code == "rival_forms")
+    assert "the term of r was selected" in warning.text
+    assert "because a learner is beside the physics" in warning.text
+
+
 def test_a_bias_beside_a_value_that_may_be_zero_is_in_no_per_cent():
     row = ParameterResult(name="c", unit="", initial=0, value=-20.0, std=107.0)
     biased = BiasResult(value=-2.2e4, cause="T**2", share=None)

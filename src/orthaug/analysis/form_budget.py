@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -63,14 +63,23 @@ def _untried(terms: FormTerms) -> Warning | None:
         for place, parameter in enumerate(fit.problem.parameters)
         if parameter.selected and fit.known_std[place] > 0 and terms.forms(place) is None
     ]
-    if not found:
-        return None
+    why = "it acts in several equations or is a function"
+    return _form_alone(found, why) if found else None
+
+
+def forms_beside(fit: Any) -> list[Warning]:
+    """Return the warning that a learner beside the physics leaves a selected form alone."""
+    found = [one.name for one in fit.problem.parameters if one.selected] if fit.learns else []
+    return [_form_alone(found, "a learner is beside the physics")] if found else []
+
+
+def _form_alone(names: Sequence[str], why: str) -> Warning:
     return Warning(
         "rival_forms",
-        f"the form of the term{'s' if len(found) > 1 else ''} of {join_words(found)} was selected "
-        "from these data. No other form was tried, because it acts in several equations or is a "
-        "function. All intervals hold for this form alone. Remedy: fit other forms of it, too, and "
-        "compare the parameters. Where the form is known from elsewhere, leave out `selected`.",
+        f"the form of the term{'s' if len(names) > 1 else ''} of {join_words(names)} was selected "
+        f"from these data. No other form was tried, because {why}. All intervals hold for this "
+        "form alone. Remedy: fit other forms of it, too, and compare the parameters. Where the "
+        "form is known from elsewhere, leave out `selected`.",
     )
 
 

@@ -17,7 +17,7 @@ from orthaug.analysis.budget import Budget, budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import physical_rows
-from orthaug.analysis.form_budget import budget_by_forms
+from orthaug.analysis.form_budget import budget_by_forms, forms_beside
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
@@ -188,6 +188,7 @@ def _of_lagged(
             warnings,
         ),
     }
+    warnings += forms_beside(fit)
     found["bias"] = _with_causes(found["bias"], found["budget"])
     return found
 
@@ -286,6 +287,7 @@ def _of_motion(
         "the bias by suspects", lambda: _biases(fit, evidence.suspects), warnings, (None, None)
     )
     warnings += budget.warnings if budget else ()
+    warnings += forms_beside(fit)
     warnings += _found_suspects(table or (), {one.name for one in evidence.suspects})
     return found | {"bias": table, "budget": budget}
 
