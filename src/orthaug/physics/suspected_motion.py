@@ -183,7 +183,7 @@ def factor_of(equation: str, parameter: str) -> str | None:
         product = above[product]
     node, alone = product, True
     while not isinstance(above[node], ast.Expression):
-        over = above[node]
+        over: Any = above[node]
         divided = _is(over, ast.Div) and over.left is node
         if not (divided or isinstance(over, ast.UnaryOp) or _is(over, ast.Add, ast.Sub, ast.Mult)):
             return None
