@@ -36,6 +36,7 @@ from orthaug.commands.proposals import (
     mending_proposals,
     noise_model_proposals,
 )
+from orthaug.data.spec_lines import changed_lines
 from orthaug.data.wild import mendings
 from orthaug.fitting.held_out import Candidate, Focus
 from orthaug.reports.page_verdict import fit_verdict
@@ -122,11 +123,17 @@ def test_the_right_term_is_advised_with_its_figure_in_text_page_and_numbers(tmp_
     assert term["change"]["baseline.terms"][-1] == {
         "parameter": "size",
         "regressor": "sign(v[k-1])",
+        "selected": True,
     }
     assert result["advice"] == sorted(result["advice"], key=lambda a: a["after"])
     first = result["advice"][0]["text"]
     assert f"Next: {first}" in printed and result["advice_trials"]["text"] in printed
     assert first in html.unescape((tmp_path / "out/report.html").read_text())
+    copied = out.partition("Write into the spec, and fit again:\n")[2].partition("\nOr: ")[0]
+    assert copied.strip() == "\n".join(changed_lines(result["spec"], result["advice"][0]["change"]))
+    assert tomllib.loads(copied)["baseline"]["terms"] == [
+        result["advice"][0]["change"]["baseline.terms"][-1]
+    ]
 
 
 def test_advice_that_is_followed_does_what_it_says(tmp_path):

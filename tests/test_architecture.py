@@ -59,6 +59,7 @@ ENTRIES = {
 CONCEPTS = {
     "_base.kept_programs": "traced programs on disk",
     "analysis.amplitude_dependence": "the nearest linear system over movements of some size",
+    "analysis.form_budget": "what other forms of selected terms make of the parameters",
     "selection.linear_runs": "linear models by the error of their free run",
     "_base.host_calls": "the interface of XLA to functions of the host",
     "physics.fmu": "a kind of source",

@@ -350,6 +350,12 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
         "g",
         "cubic",
     ]
+    assert [bool(term.selected) for term in oa.load_spec(grown).spec.baseline.terms] == [
+        False,
+        False,
+        False,
+        True,
+    ]
     page = run("explain", project / "plant", project / "run.csv").out
     assert (
         page.startswith("y[k-1]**3 explains 9")

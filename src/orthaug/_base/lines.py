@@ -319,6 +319,15 @@ def _fold(line: str, width: int) -> list[str]:
     return [part.replace(_UNBROKEN, " ") for part in wrapped]
 
 
+def join_blocks(blocks: Iterable[Sequence[str]]) -> str:
+    """Return blocks of folded lines with empty lines between them.
+
+    A block that contains an empty line is to be copied, and stays as it is.
+    """
+    folded = (lines if "" in lines else fold(lines) for lines in blocks if lines)
+    return "\n\n".join("\n".join(lines) for lines in folded)
+
+
 def with_unit(name: str, unit: str | None) -> str:
     """Return a name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name

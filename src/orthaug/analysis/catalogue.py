@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,8 @@ class Family(NamedTuple):
     scaled: bool = True
     level: Callable[[str, str], str] | None = None
     """Writes one that acts on what is never negative, where that is shorter."""
+    positive: bool = False
+    """True if it acts only on what is positive."""
 
     def expression(self, on: str, width: str, *, level: bool = False) -> str:
         """Return the member of a width, or power, that acts on an expression."""
@@ -85,11 +88,17 @@ FAMILIES = (
 )
 
 
+_OF_LEVELS: dict[str, Callable[[str, str], str]] = {
+    "stribeck": lambda x, w: f"exp(-{x}/{w})",
+    "dead_zone": lambda x, w: f"max({x} - {w}, 0)",
+    "saturation": lambda x, w: f"min({x}, {w})",
+}
 RIVALS = (
-    *(family for family in FAMILIES if family.name != "power"),
+    *(one._replace(level=_OF_LEVELS.get(one.name)) for one in FAMILIES if one.name != "power"),
     Family("power", _odd_power, (*_POWERS, 3.5, 4.0, 5.0), False, lambda x, w: f"{x}**{w}"),
     Family("exp", lambda x, w: f"exp({x}/{w})", (0.5, 1.0, 2.0)),
     Family("decay", lambda x, w: f"exp(-{x}/{w})", (0.5, 1.0, 2.0)),
+    Family("log", lambda x, w: f"log({x})", (1.0,), scaled=False, positive=True),
 )
 """What may take the place of a term whose form was selected: a radiation is no cubic."""
 SMOOTH_FRICTION = {family.name: family for family in FAMILIES if family.name in ("tanh", "atan")}
@@ -233,6 +242,16 @@ class Catalogue:
             for text in self.products
         )
 
+    def products_of(self, names: Sequence[str]) -> tuple[Any, ...]:
+        """Return products of two of these names, each linear or one squared; none of many names."""
+        pairs = list(combinations(names, 2)) if len(names) <= _MULTIPLIED else []
+        texts = [text for a, b in pairs for text in (f"{a}*{b}", f"{a}**2*{b}", f"{a}*{b}**2")]
+        return tuple(
+            self.of_text(text, None, place, f"{text}{self._label(place)}")
+            for place in self.places
+            for text in texts
+        )
+
     def families(self, families: Sequence[Family] = FAMILIES) -> tuple[Any, ...]:
         """Return every member of every family, on everything that the learner sees."""
         return tuple(
@@ -257,7 +276,10 @@ def family_members(
     if not np.any(size > 0):
         return
     median = float(np.median(size[size > 0]))
+    positive = bool(np.min(values, initial=np.inf) > 0)
     for family in families:
+        if family.positive and not positive:
+            continue
         for member in family.members:
             w = f"{member * (median if family.scaled else 1.0):.4g}"
             text = family.expression(on, w, level=bool(np.min(values, initial=0.0) >= 0))

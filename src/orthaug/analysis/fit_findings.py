@@ -66,7 +66,7 @@ class ParameterResult(Content):
     """A parameter with its interval."""
 
     absent: ClassVar = frozenset(
-        {"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts"}
+        {"derived_unit", "one_step", "profile95", "plain_std", "shared", "ci95_counts", "selected"}
     )
 
     name: str
@@ -82,6 +82,8 @@ class ParameterResult(Content):
     ci95_counts: Literal["noise only"] | None = None
     """What the interval counts, where the residual shows more than noise."""
     profile95: Numbers | None = None
+    selected: Flag | None = None
+    """True of the coefficient of a term whose form was selected from the data."""
     shared: Flag | None = None
     bias: BiasResult | None = None
     ci95_with_bias: Numbers | None = None
@@ -95,6 +97,13 @@ class ParameterResult(Content):
     def errors_of_bias(self) -> float:
         """The size of its bias in standard errors."""
         return abs(self.bias.value or 0.0) / self.std if self.bias and self.std else 0.0
+
+    @property
+    def share_of_bias(self) -> float | None:
+        """Its bias over its value; None of a value that may be 0."""
+        if self.bias is None or not self.value or abs(self.value) <= (self.std or 0.0):
+            return None
+        return (self.bias.value or 0.0) / self.value
 
     def with_bias(self, shared: bool | None, bias: ParameterBias | None) -> ParameterResult:
         """Return the parameter with its bias, and with whether the learner could imitate it."""
@@ -348,6 +357,7 @@ def parameter_rows(
                 "std": None if std is None else std[i],
                 "plain_std": None if plain_std is None else plain_std[i],
                 "ci95": None if interval is None or np.isnan(interval[i]).any() else interval[i],
+                "selected": parameter.selected or None,
             }
         )
         for i, parameter in enumerate(parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from orthaug._base.lines import first_words, join_words
 from orthaug.analysis.bias_hull import AS_LIKELY, OtherForm, hull
 from orthaug.analysis.budget import Budget, BudgetTerms
 from orthaug.analysis.parameter_bias import (
+    ParameterBias,
     farthest,
     owners_of,
     parameter_biases,
@@ -21,6 +22,7 @@ from orthaug.analysis.parameter_bias import (
 from orthaug.analysis.rival_forms import RivalForm, SelectedTerms, rival_forms
 
 _LISTED = 3  # forms and parameters that a warning lists at most
+_ROUNDING = 1e-6  # of a standard error
 
 
 class FormTerms(BudgetTerms, SelectedTerms, Protocol):
@@ -30,14 +32,14 @@ class FormTerms(BudgetTerms, SelectedTerms, Protocol):
 def budget_by_forms(terms: FormTerms) -> Budget | None:
     """Return the bias of every parameter by the forms that fit as well as the selected ones.
 
-    None where a learner is beside the physics, and where no form was selected or has a rival.
+    None where a learner is beside the physics, and where no form was selected or has a rival. A
+    warning names the terms of which no other form can be tried.
     """
-    if terms.learned is not None:
+    if terms.learned is not None or not any(p.selected for p in terms.fit.problem.parameters):
         return None
-    rivals, untried = rival_forms(terms)
-    warnings = [untried_forms_warning(untried)] if untried else []
+    rivals, alone = rival_forms(terms), _untried(terms)
     if not rivals:
-        return Budget((), 1.0, (), (), tuple(warnings)) if untried else None
+        return Budget((), 1.0, (), (), (alone,)) if alone else None
     fit, value = terms.fit, terms.value
     moved = np.array([rival.moved for rival in rivals])
     forms = [OtherForm(rival.name, 1.0, rival.moved) for rival in rivals]
@@ -48,22 +50,47 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     owners = owners_of(forms, moved)
     rows = parameter_biases(terms.names, value, std, bias, ends, owners, fit.freedom)
     physical, unbounded = physical_biases(terms, forms, every)
-    rows, physical = (tuple(row for row in of if row.value) for of in (rows, physical))
-    implied = _warning(rivals, terms.names, value, moved, std)
-    warnings += [*([implied] if implied else []), *unbounded]
-    return Budget((), 1.0, rows, physical, tuple(warnings))
+    rows, physical = (tuple(filter(_is_moved, of)) for of in (rows, physical))
+    warnings = [_warning(rivals, terms.names, value, moved, std), alone, *unbounded]
+    return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
 
 
-def untried_forms_warning(names: Sequence[str]) -> Warning:
-    """Return the warning that other forms of selected terms could not be tried."""
-    whose = f"the term{'s' if len(names) > 1 else ''} of {join_words(names)}"
+def _untried(terms: FormTerms) -> Warning | None:
+    """Return the warning that names selected terms of which no other form can be tried."""
+    fit = terms.fit
+    found = [
+        parameter.name
+        for place, parameter in enumerate(fit.problem.parameters)
+        if parameter.selected and fit.known_std[place] > 0 and terms.forms(place) is None
+    ]
+    why = "it acts in several equations or is a function"
+    return _form_alone(found, why) if found else None
+
+
+def selected_alone(fit: Any, *, forecasts: bool = False) -> list[Warning]:
+    """Return the warning that what is beside the physics leaves a selected form alone.
+
+    Args:
+        forecasts: True for a motion whose noise model forecasts its errors.
+    """
+    beside = "a learner" if fit.learns else "a noise model" if forecasts else ""
+    found = [one.name for one in fit.problem.parameters if one.selected] if beside else []
+    return [_form_alone(found, f"{beside} is beside the physics")] if found else []
+
+
+def _form_alone(names: Sequence[str], why: str) -> Warning:
     return Warning(
-        "untried_forms",
-        f"the form of {whose} was selected from these data, and no other form can be tried. It has "
-        "no standard error, acts in several equations, or is beside a noise model of a motion. All "
-        "intervals hold for this form alone. Remedy: where the form is known from elsewhere, leave "
-        "out `selected`.",
+        "rival_forms",
+        f"the form of the term{'s' if len(names) > 1 else ''} of {join_words(names)} was selected "
+        f"from these data. No other form was tried, because {why}. All intervals hold for this "
+        "form alone. Remedy: fit other forms of it, too, and compare the parameters. Where the "
+        "form is known from elsewhere, leave out `selected`.",
     )
+
+
+def _is_moved(row: ParameterBias) -> bool:
+    """Return whether a bias is more than rounding."""
+    return abs(row.value) > 0 and (row.errors is None or row.errors > _ROUNDING)
 
 
 def _warning(
@@ -89,9 +116,14 @@ def _warning(
     first = f" {rivals[0].name} fits clearly better." if rivals[0].rise < -AS_LIKELY else ""
     return Warning(
         "rival_forms",
-        f"the form of {whose} was selected from these data, and {first_words(forms, _LISTED)} "
+        f"the form of {whose} was selected from these data, and {_some(forms)} "
         f"fit{'s' if len(forms) == 1 else ''} as well: with these forms {join_words(reach)}. The "
         "standard errors hold for the selected form alone, the intervals with the bias for all of "
         f"these.{first} Remedy: data over a wider range. Where the form is known from elsewhere, "
         "leave out `selected`.",
     )
+
+
+def _some(forms: Sequence[str]) -> str:
+    """Return the first forms in words, and how many more there are."""
+    return first_words(forms, _LISTED) if len(forms) > _LISTED else join_words(forms)

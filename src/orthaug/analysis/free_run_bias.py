@@ -51,7 +51,7 @@ from orthaug.models.motion_field import parts_at
 from orthaug.physics.motion import Motion
 from orthaug.physics.projection import Projection
 from orthaug.physics.shared import SharedDirections, moves
-from orthaug.physics.suspected_motion import equations_of
+from orthaug.physics.suspected_motion import equations_of, factor_of
 
 _SAME = 1e-6  # of its size: what a term may change over a move that the learner does not see
 # Of the learned equations: a learner that is smaller, and biases nothing, found nothing
@@ -186,18 +186,39 @@ class MotionTerms:
         place = equations_of(motion)[acts[0]]
         named = (*motion.names_of_states, *motion.inputs)
         read = [name for name in named if name in motion.visible]
-        catalogue = Catalogue.of_motion(motion, self.value, x, u, read)
+        pairs = [pair for pair in motion.differences if {*pair} <= {*read}]
+        features = [*(f"{a} - {b}" for a, b in pairs), *read]
+        catalogue = Catalogue.of_motion(motion, self.value, x, u, features)
         catalogue = replace(catalogue, places=(place,))
-        every = (*catalogue.usual(), *catalogue.families(RIVALS))
+        every = (*catalogue.usual(), *catalogue.products_of(read), *catalogue.families(RIVALS))
         values = np.stack([form.values(motion, self.value, x, u) for form in every], axis=1)
+        factor = self._factor(selected)
+        if factor is not None:
+            by = MotionSuspect("factor", factor, place).values(motion, self.value, x, u)
+            values = by[:, None] * values
         others = ~self.shapes(selected)
         others[selected] = False
         here = slopes[:, acts[0]]
-        return Forms(every, values, here[:, others], here[:, selected])
+        return Forms(every, values, here[:, others], here[:, selected], linear=False)
 
-    def with_forms(self, forms: Sequence[MotionSuspect]) -> TermEquations:
-        """Return the normal equations of the free run with further terms."""
+    def with_forms(self, selected: int, forms: Sequence[MotionSuspect]) -> TermEquations:
+        """Return the normal equations of the free run with further forms of a term."""
+        factor = self._factor(selected)
+        if factor is not None:
+            forms = [replace(f, expression=f"({factor})*({f.expression})") for f in forms]
         return respond_to(self.place, tuple(form.term(self.motion) for form in forms))
+
+    def _factor(self, selected: int) -> str | None:
+        """Return what multiplies a term in its equation: 1/L of `(u - s*x**3)/L`.
+
+        None where it stands by itself.
+        """
+        name = self.names[selected]
+        for expression in self.motion.equations.values():
+            found = factor_of(expression.text, name)
+            if found is not None:
+                return found
+        return None
 
     def shapes(self, selected: int) -> Bool[np.ndarray, "np"]:
         """Return a mask of the parameters that have no effect where that one is nearly 0."""

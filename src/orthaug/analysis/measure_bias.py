@@ -49,6 +49,7 @@ CERTIFIED_ROWS = 200_000
 _REMOVED = 0.1  # of a bias may remain
 _MEASURED_ROWS = 50_000  # above which no other measure is tried
 _FORM_ROWS = 20_000  # on which other forms of a term are tried
+_SAME = 1e-9  # of a term's size: it is one form in several outputs
 _NOTHING = 0.01  # of the noise: a learner that is smaller found nothing that could be explained
 
 
@@ -236,36 +237,41 @@ class LaggedTerms:
     def forms(self, selected: int) -> Forms[Suspect] | None:
         """Return other forms of the term of a parameter: on its own lags, and the usual ones.
 
-        None where it acts on several outputs.
+        None where it has other forms in other outputs.
         """
-        problem, every = self.problem, self._every
-        x, outputs = problem.rows.x[every], problem.outputs
-        phi = problem.phi(x)
-        acts = np.flatnonzero(np.any(phi[:, :, selected], axis=0))
-        if len(acts) != 1:
+        problem, shares = self.problem, self._shares(selected)
+        if shares is None:
             return None
-        output, name = outputs[acts[0]], problem.names[selected]
+        x, place = problem.rows.x[self._every], int(np.argmax(shares != 0))
+        output, name = problem.outputs[place], problem.names[selected]
+        phi = problem.phi(x)[:, place]
         read = [
             str(lag)
             for term in problem.baseline.terms or ()
             if term.parameter == name
             for lag in parse(term.regressor, dict(problem.baseline.constants)).lags
         ]
-        seen = [Argument(text, self._values_of(text, x)) for text in dict.fromkeys(read)]
+        read = list(dict.fromkeys(read))
+        steps = [one.text for one in self.catalogue.arguments if one.text not in read]
+        steps = [text for text in steps if {*map(str, parse(text).lags)} <= {*read}]
+        seen = [Argument(text, self._values_of(text, x)) for text in (*read, *steps)]
         catalogue = replace(self.catalogue, places=(output,), seen=(*seen,))
-        every_form = (*catalogue.usual(), *catalogue.two_lags(), *catalogue.families(RIVALS))
-        own = np.delete(phi[:, acts[0]], selected, axis=1)
+        every_form = (*catalogue.usual(), *catalogue.two_lags(), *catalogue.products_of(read))
+        every_form = (*every_form, *catalogue.families(RIVALS))
+        own = np.delete(phi, selected, axis=1)
         with np.errstate(all="ignore"):  # of an exponential that overflows none is tried
             values = [self._values_of(form.expression, x) for form in every_form]
-        return Forms(every_form, np.stack(values, axis=1), own, phi[:, acts[0], selected])
+        return Forms(every_form, np.stack(values, axis=1), own, phi[:, selected], linear=True)
 
-    def with_forms(self, forms: Sequence[Suspect]) -> RowEquations:
-        """Return the least squares of θ and of further terms on the training rows."""
-        problem = self.problem
+    def with_forms(self, selected: int, forms: Sequence[Suspect]) -> RowEquations | None:
+        """Return the least squares of θ and of further forms of a term on the training rows."""
+        problem, shares = self.problem, self._shares(selected)
+        if shares is None:
+            return None
         every = self._every if problem.noise is None else slice(None)  # its filter needs all rows
         x, weight = problem.rows.x[every], problem.weight.matrix
-        terms = [self._sampled(form).values(x, problem.layout, problem.outputs) for form in forms]
-        rows = np.concatenate([problem.phi(x), np.stack(terms, axis=-1)], axis=-1)
+        values = np.stack([self._sampled(form).form(x, problem.layout) for form in forms], axis=-1)
+        rows = np.concatenate([problem.phi(x), shares[:, None] * values[:, None]], axis=-1)
         rows = rows if problem.noise is None else problem.noise.rows(rows)
         rows = np.einsum("oi,nik->nok", weight, rows).reshape(-1, rows.shape[-1])
         count = len(self.theta)
@@ -274,6 +280,17 @@ class LaggedTerms:
         left = left - basis @ (basis.T @ left)
         fitted = np.arange(rows.shape[1]) < count
         return RowEquations(rows.T @ rows, rows.T @ left, fitted)
+
+    def _shares(self, selected: int) -> Vector | None:
+        """Return what a term does to each output over what it does to the first that has it.
+
+        None where that differs between rows: it then has several forms.
+        """
+        own = self.problem.phi(self.problem.rows.x[self._every])[:, :, selected]
+        size = np.linalg.norm(own, axis=0)
+        first = own[:, int(np.argmax(size > 0))]
+        shares = first @ own / max(float(first @ first), np.finfo(float).tiny)
+        return shares if np.all(np.abs(own - shares * first[:, None]) <= _SAME * size) else None
 
     def shapes(self, selected: int) -> Bool[np.ndarray, "nt"]:
         """Return none: all parameters multiply their terms."""

@@ -136,7 +136,9 @@ def parameter_biases(
         names, value, std, bias, ends, causes, strict=True
     ):
         if np.isfinite(b):
-            errors, relative = float(abs(b) / s) if s > 0 else None, float(b / v) if v else None
+            errors = float(abs(b) / s) if s > 0 else None
+            # Per cent of what may be 0 mean nothing
+            relative = float(b / v) if v and not abs(v) <= s else None
             limits = (float(ci[0]), float(ci[1])) if np.isfinite(ci).all() else None
             determined = limits is None or is_determined(float(v), float(s), freedom, *limits)
             found.append(

@@ -17,7 +17,7 @@ from orthaug.analysis.budget import Budget, budget_on
 from orthaug.analysis.diagnosis import diagnose
 from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.fit_findings import physical_rows
-from orthaug.analysis.form_budget import budget_by_forms, untried_forms_warning
+from orthaug.analysis.form_budget import budget_by_forms, selected_alone
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
@@ -27,7 +27,6 @@ from orthaug.analysis.measure_bias import LaggedTerms, bias_under
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.analysis.other_solutions import find_other_solution
-from orthaug.analysis.rival_forms import selected_terms
 from orthaug.fitting.elimination import directions
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
@@ -189,6 +188,7 @@ def _of_lagged(
             warnings,
         ),
     }
+    warnings += selected_alone(fit)
     found["bias"] = _with_causes(found["bias"], found["budget"])
     return found
 
@@ -287,6 +287,7 @@ def _of_motion(
         "the bias by suspects", lambda: _biases(fit, evidence.suspects), warnings, (None, None)
     )
     warnings += budget.warnings if budget else ()
+    warnings += selected_alone(fit, forecasts=fit.model.coloured)
     warnings += _found_suspects(table or (), {one.name for one in evidence.suspects})
     return found | {"bias": table, "budget": budget}
 
@@ -316,9 +317,7 @@ def _biases(
     """Return the table of suspects and of the causes in the budget, and the budget."""
     terms = linearize_fit(fit)
     if terms is None:
-        untried = [] if fit.learns else selected_terms(fit)
-        alone = Budget((), 1.0, (), (), (untried_forms_warning(untried),)) if untried else None
-        return None, alone
+        return None, None
     table = bias_table(terms, suspects)
     budget = budget_on(terms, suspects, table) or budget_by_forms(terms)
     return _with_causes([entry.as_dict() for entry in table], budget) or None, budget

@@ -10,9 +10,10 @@ the term's coefficient p falls to 0, `δ_p = −p̂`, and all others follow,
 
 A form that raises them by no more than 12 variances of the errors over the best may be the true
 one, as for causes of a learner (`bias_hull`); by more where some form beside the term lowers them,
-since then the term itself is not. The change of the equations is small for such a form, whatever
-the size of the term, so that the first order is enough. The interval of a parameter is the hull
-over them (`form_budget`).
+since then the term itself is not. Of motions those are tried that do nearly what the term does:
+their change of the equations is small, whatever the size of the term, so that the first order is
+enough. Of lagged physics others count, too, where they fit clearly better. The interval of a
+parameter is the hull over them (`form_budget`).
 """
 
 from __future__ import annotations
@@ -29,17 +30,25 @@ from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias_hull import AS_LIKELY, LEAST
 from orthaug.analysis.free_run_equations import solve_scaled
 
-_MOST_FORMS = 24  # tried in the fit's equations: those that are most alike
+_MOST_FORMS = 24  # tried in equations of first order: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
 _SAME = 1e-3  # of what two forms do: they are one by two names
 _SPANNED = 1e-10  # of a term's squares: what is left of one that others express
+_CONSTANT = 1e-6  # of a constant: what is left of it beside physics that has one
 _BY_CHANCE = 9.0  # variances by which some form lowers the squares of a term that is true
 _PLAIN = 0.3  # times the size of a term beside the physics: what leaves less of a form is physics
 _UNLIKE = 0.1  # of a term's squares beside the physics: a form that leaves no more is tried
 _MOST_UNLIKE = 0.5  # one that leaves more is not, whatever the noise
 
 
-T = TypeVar("T")
+class Written(Protocol):
+    """A form with its expression."""
+
+    @property
+    def expression(self) -> str: ...
+
+
+T = TypeVar("T", bound=Written)
 
 
 class Forms(NamedTuple, Generic[T]):
@@ -51,13 +60,18 @@ class Forms(NamedTuple, Generic[T]):
     """Of the equation by the other parameters."""
     own: Float[np.ndarray, "m"]
     """The term for a coefficient of 1."""
+    linear: bool
+    """True if the fit's equations are exact for any form: what fits clearly better counts then."""
 
-    def most_alike(self, least: float) -> list[T]:
-        """Return the forms that explain a term beside the physics, the best first.
+    def most_alike(self, least: float) -> list[tuple[T, bool]]:
+        """Return the forms that may take a term's place, the most alike first.
+
+        With each is whether it does nearly what the term does beside the physics.
 
         Args:
-            least: share of it that a form explains at least.
+            least: share of that which such a form explains at least.
         """
+        lowest = 0.0 if self.linear else least
         with np.errstate(all="ignore"):
             there = np.isfinite(self.slopes).all(axis=1) & np.isfinite(self.own)
         values, own = self.values[there], self.own[there]
@@ -67,17 +81,24 @@ class Forms(NamedTuple, Generic[T]):
         basis = np.linalg.qr(self.slopes[there] / np.where(size > 0, size, 1.0))[0]
         term, others = own - basis @ (basis.T @ own), values - basis @ (basis.T @ values)
         whole, squares = float(term @ term), np.sum(others**2, axis=0)
-        beside = whole / max(float(own @ own), np.finfo(float).tiny)
-        if not beside > _SPANNED:
+        if not whole > _SPANNED * float(own @ own):
             return []
-        # What is nearly the physics itself fits anything with a huge size
-        usable &= squares > _PLAIN**2 * beside * np.sum(values**2, axis=0)
+        # What is nearly the physics itself fits anything with a huge size. A constant beside log(I)
+        # does not make it so: that counts from a unit of I
+        sizes, level = np.sum(values**2, axis=0), np.ones(len(own)) / np.sqrt(len(own))
+        if np.linalg.norm(level - basis @ (basis.T @ level)) < _CONSTANT:
+            by_unit = np.array([form.expression.startswith("log(") for form in self.forms])
+            sizes = np.where(by_unit, sizes - (level @ values) ** 2, sizes)
+        beside = whole / max(float(own @ own), np.finfo(float).tiny)
+        usable &= squares > _PLAIN**2 * beside * sizes
         shares = np.where(usable, (term @ others) ** 2 / np.where(usable, squares, 1.0), 0.0)
         order = np.argsort(-shares, kind="stable")
         # What explains all of it is the term itself, by another name
         return [
-            self.forms[k] for k in order if least * whole <= shares[k] <= (1 - _SPANNED) * whole
-        ][:_MOST_FORMS]
+            (self.forms[k], bool(shares[k] >= least * whole))
+            for k in order
+            if lowest * whole <= shares[k] <= (1 - _SPANNED) * whole and usable[k]
+        ][: None if self.linear else _MOST_FORMS]
 
 
 class FormEquations(Protocol):
@@ -126,8 +147,8 @@ class SelectedTerms(Protocol):
         """
         ...
 
-    def with_forms(self, forms: Sequence[Any]) -> FormEquations | None:
-        """Return the fit's normal equations with further terms; None where there are none."""
+    def with_forms(self, selected: int, forms: Sequence[Any]) -> FormEquations | None:
+        """Return the fit's normal equations with further forms of a term; None without any."""
         ...
 
     def shapes(self, selected: int) -> Bool[np.ndarray, "nt"]:
@@ -159,48 +180,32 @@ class RivalForm:
         return close and bool(apart <= _SAME * np.linalg.norm(self.moved))
 
 
-def selected_terms(fit: Any) -> list[str]:
-    """Return the coefficients of the terms whose forms were selected."""
-    return [parameter.name for parameter in fit.problem.parameters if parameter.selected]
-
-
-def rival_forms(terms: SelectedTerms) -> tuple[list[RivalForm], list[str]]:
+def rival_forms(terms: SelectedTerms) -> list[RivalForm]:
     """Return the forms that fit as well as those that were selected, the best first.
 
-    With the coefficients of terms in whose place no other form can be tried: they have no standard
-    error, or act in several equations.
+    Empty without a selected term, and where the coefficient has no standard error.
     """
     found: list[RivalForm] = []
-    untried: list[str] = []
-    for name in selected_terms(terms.fit):
-        place = terms.fit.problem.names.index(name)
+    for place, parameter in enumerate(terms.fit.problem.parameters):
         std = terms.fit.known_std[place]
-        known = terms.value[place] != 0 and std > 0
-        t = float(abs(terms.value[place]) / std) if known else 0.0
-        rivals = _rivals_of(terms, place, t) if known else None
-        untried += [name] if rivals is None else []
-        found += rivals or []
+        if parameter.selected and terms.value[place] != 0 and std > 0:
+            found += _rivals_of(terms, place, float(abs(terms.value[place]) / std))
     found.sort(key=lambda rival: rival.rise)
-    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))], untried
+    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))]
 
 
-def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm] | None:
-    """Return the rivals of one term, whose coefficient is `t` standard errors large.
-
-    None where no other form can be tried.
-    """
+def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
+    """Return the rivals of one term, whose coefficient is `t` standard errors large."""
     # A form that differs by what noise hides in the fit's equations may differ by more at points
     least = 1 - max(_UNLIKE, min(4 * AS_LIKELY / t**2, _MOST_UNLIKE))
     forms = terms.forms(place)
-    if forms is None:
-        return None
-    likely = forms.most_alike(least)
-    equations = terms.with_forms(likely) if likely else None
+    likely = [] if forms is None else forms.most_alike(least)
+    equations = terms.with_forms(place, [form for form, _ in likely]) if likely else None
     if equations is None:
         return []
     information, gradient, count = equations.information, equations.gradient, len(terms.value)
     if not np.isfinite(information).all() or not np.isfinite(gradient).all():
-        return None
+        return []
     others = equations.fitted.copy()
     others[:count] &= ~terms.shapes(place)
     others[place] = False
@@ -209,7 +214,7 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm] | 
         information[np.ix_(others, others)], across
     )
     if not own > 0:
-        return None
+        return []
     gone = -terms.value[place] / terms.slopes[place]
     variance = own * gone**2 / t**2
 
@@ -221,15 +226,18 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm] | 
 
     left = information[place, place] * gone**2 - 2 * gradient[place] * gone
     found, lacks = [], 0.0
-    for k, form in enumerate(likely):
+    for k, (form, alike) in enumerate(likely):
         free = others.copy()
         free[count + k] = True
         step, falls = moved_by(free, gradient - information[:, place] * gone)
+        rise = (left - falls) / variance
         shift = -(terms.slopes * step[:count])
         shift[place] = 0.0  # its coefficient is none of another form
-        found.append(RivalForm(terms.names[place], form, (left - falls) / variance, shift))
-        free[place] = True
-        lacks = max(lacks, moved_by(free, gradient)[1] / variance)
+        if alike or rise < -AS_LIKELY:
+            found.append(RivalForm(terms.names[place], form, rise, shift))
+        if alike:
+            free[place] = True
+            lacks = max(lacks, moved_by(free, gradient)[1] / variance)
     best = min(0.0, *(rival.rise for rival in found))
     # No form may be the true one: what the best lacks, another may lack as well
     most = AS_LIKELY * (1 + max(lacks - _BY_CHANCE, 0.0))

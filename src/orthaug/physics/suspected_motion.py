@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -13,6 +14,8 @@ from orthaug._base.jax import ArrayModule
 from orthaug.data.expressions import Expression
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
+
+_LONGEST = 400  # characters of a factor: an expression has at most 500
 
 
 class Memory(Protocol):
@@ -157,3 +160,41 @@ def usual_places(motion: Motion) -> tuple[int, ...]:
     if motion.functions is not None:
         return tuple(range(len(motion.states)))
     return tuple(i for i, state in enumerate(motion.states) if motion.parameters_in(state.name))
+
+
+def factor_of(equation: str, parameter: str) -> str | None:
+    """Return what multiplies the product with a parameter in an equation.
+
+    None where the product is a summand by itself, where the equation is not linear in it, and where
+    it has the parameter in no or several places.
+
+    Examples:
+        >>> factor_of("(b*u - s*x*abs(x))/L", "s")
+        '((b*u - 1)/L) - ((b*u - 0)/L)'
+        >>> factor_of("b*u - s*x**3", "s")
+    """
+    tree = ast.parse(equation, mode="eval")
+    above = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
+    places = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id == parameter]
+    if len(places) != 1 or 2 * len(equation) > _LONGEST:
+        return None
+    product: Any = places[0]
+    while isinstance(above[product], ast.UnaryOp) or _is(above[product], ast.Mult):
+        product = above[product]
+    node, alone = product, True
+    while not isinstance(above[node], ast.Expression):
+        over: Any = above[node]
+        divided = _is(over, ast.Div) and over.left is node
+        if not (divided or isinstance(over, ast.UnaryOp) or _is(over, ast.Add, ast.Sub, ast.Mult)):
+            return None
+        alone = alone and _is(over, ast.Add, ast.Sub)
+        node = over
+    if alone:
+        return None
+    before, after = equation[: product.col_offset], equation[product.end_col_offset :]
+    return f"({before}1{after}) - ({before}0{after})"
+
+
+def _is(node: Any, *operators: type[ast.operator]) -> bool:
+    """Return whether a node is one of these operators between two others."""
+    return isinstance(node, ast.BinOp) and isinstance(node.op, operators)

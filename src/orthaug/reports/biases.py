@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -78,6 +79,13 @@ def hang_on_form(rows: Sequence[ParameterResult]) -> list[ParameterResult]:
     return [row for row in rows if row.bias and row.bias.share is None]
 
 
+def of_selected_form(result: Any) -> list[str]:
+    """Return the coefficients of selected terms, where other forms fit as well."""
+    if not any(warning.code == "rival_forms" for warning in result.warnings):
+        return []
+    return [row.name for row in result.parameters if row.selected]
+
+
 def is_biased(row: ParameterResult) -> bool:
     """Return whether a bias is larger than the standard error."""
     return row.bias is not None and bool(row.std) and abs(row.bias.value or 0.0) > (row.std or 0.0)
@@ -89,7 +97,8 @@ def size_of_bias(rows: Sequence[ParameterResult]) -> str:
     if worst.bias is None or worst.bias.value is None:
         return ""
     times = f"{plain_number(worst.errors_of_bias)} times its standard error"
-    share = percent(worst.bias.value / worst.value, sign="+") if worst.value else ""
+    relative = worst.share_of_bias
+    share = "" if relative is None else percent(relative, sign="+")
     size = f"{share}, {times}" if share else times
     return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
 

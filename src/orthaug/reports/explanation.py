@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orthaug._base.content import Flag, Number, Whole
 from orthaug._base.errors import Warning
-from orthaug._base.lines import continued, fold, percent, table
+from orthaug._base.lines import continued, fold, join_blocks, percent, table
 from orthaug.analysis.findings import MemoryResult
 from orthaug.reports.result import ResultHeader
 from orthaug.selection.explanation import ExplainingTerm, MovedParameter, SingleTerm
@@ -56,10 +56,7 @@ def explain_text(result: ExplainResult) -> str:
     elif result.terms:
         blocks.append(["The physics is a Python function: add the terms there, and fit again."])
     blocks.append([f"warning: {warning.text}" for warning in result.warnings])
-    blocks = [
-        lines if "" in lines else fold(lines) for lines in blocks
-    ]  # what is to be copied stays as it is
-    return "\n\n".join("\n".join(lines) for lines in blocks if lines)
+    return join_blocks(blocks)
 
 
 def _term_lines(result: ExplainResult) -> list[str]:

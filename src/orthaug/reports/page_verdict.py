@@ -13,7 +13,7 @@ from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult, PartScores
 from orthaug.analysis.missing_term import may_be_missing
-from orthaug.reports.biases import hang_on_form, is_biased, size_of_bias
+from orthaug.reports.biases import hang_on_form, is_biased, of_selected_form, size_of_bias
 from orthaug.reports.page_blocks import number, percent
 from orthaug.reports.result import CompareResult, FitResult, RowResult
 
@@ -319,11 +319,11 @@ def _doubts(result: Findings | RowResult, *, held_out: bool) -> Iterator[str]:
             "part of its free run"
         )
     formed = [row for row in hang_on_form(_rows(result)) if is_biased(row)]
-    if formed:
-        names = [row.name for row in formed]
+    if formed or of_selected_form(result):
+        names = list(dict.fromkeys([row.name for row in formed] + of_selected_form(result)))
         yield (
             f"{join_words(names)} hang{'s' if len(names) == 1 else ''} on the form of a term that "
-            f"was selected from the data{size_of_bias(formed)}"
+            f"was selected from the data{size_of_bias(formed) if formed else ''}"
         )
     biased = [row.name for row in _rows(result) if is_biased(row) and row not in formed]
     if biased:
@@ -407,7 +407,6 @@ _DEFECTS = (
 )
 _UNTESTED = {
     "explains_nothing": "its free run explains nothing of an output",
-    "untried_forms": "a form was selected from the data, and no other can be tried",
     "quantised_output": "the steps of an output move its parameters",
     "little_left": "a parameter rests on little of its regressor beside the learner",
     "output_without_learner": "an output has parameters of a learned equation, but no learner",
@@ -432,9 +431,10 @@ _UNTESTED = {
 
 
 def _use_text(result: Findings, level: str) -> str:
-    rows, coarse = _rows(result), _moved_by_integrator(result)
-    sure = [row.name for row in rows if _is_known(row) and row.name not in coarse]
+    rows, other = _rows(result), [*_moved_by_integrator(result), *of_selected_form(result)]
+    sure = [row.name for row in rows if _is_known(row) and row.name not in other]
     untested = any(_has_warning(result, code) for code in _UNTESTED)
+    untested = untested or (bool(of_selected_form(result)) and not hang_on_form(rows))
     doubted = untested or is_biased_by_feedback(result) or _may_lack_terms(result)
     imitable = getattr(result, "shared", None)  # of results of older versions there is none
     unclear = imitable.withdrawn or [] if imitable is not None else []
@@ -442,7 +442,8 @@ def _use_text(result: Findings, level: str) -> str:
     known = clear if _noise_alone(result) and not doubted else []
     shared = [row.name for row in rows if row.shared]
     bare = [row.name for row in rows if row.std is None and not row.shared]
-    others = [row.name for row in rows if row.name not in (*sure, *shared, *bare)]
+    rest = [row.name for row in rows if row.name not in (*sure, *shared, *bare)]
+    others = list(dict.fromkeys(rest))  # θ may have the name of a physical parameter
     ahead, part = _worst_score(result.scores, "prediction")
     predicts = ahead is not None and ahead <= (_GOOD if level == "bad" else _POOR)
     if _has_warning(result, _NO_FREEDOM):

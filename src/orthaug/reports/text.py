@@ -16,6 +16,7 @@ from orthaug._base.lines import (
     estimate_cells,
     estimate_rows,
     fold,
+    join_blocks,
     percent,
     plain_number,
     plural,
@@ -24,6 +25,7 @@ from orthaug._base.lines import (
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.findings import SharedResult, SuspectResult
 from orthaug.analysis.fit_findings import Findings, ParameterResult
+from orthaug.data.spec_lines import changed_lines
 from orthaug.reports.biases import OF_FORMS, REMOVED_BY, biased_by, hang_on_form
 from orthaug.reports.page_verdict import PageVerdict, compare_verdict, fit_verdict
 from orthaug.reports.result import (
@@ -77,9 +79,9 @@ def fit_text(fit: Estimate, result: Findings) -> str:
         warning_lines(w for w in dict.fromkeys(result.warnings) if w.text not in parts),
     ]
     if isinstance(result, FitResult):
-        blocks.append(_advice_lines(result))
+        blocks += _advice_blocks(result)
     blocks.append([verdict_line(fit_verdict(result))])
-    return "\n\n".join("\n".join(fold(lines)) for lines in blocks if lines)
+    return join_blocks(blocks)
 
 
 def verdict_line(verdict: PageVerdict) -> str:
@@ -97,13 +99,19 @@ def _withdraw_claim(line: str, result: Findings) -> str:
     return line
 
 
-def _advice_lines(result: FitResult) -> list[str]:
-    """Return the changes that lowered the free run's error, and a count of all trials."""
-    lines = [
-        f"{'Next: ' if i == 0 else 'Or: '}{advice.text}"
-        for i, advice in enumerate(result.advice[:ADVISED])
-    ]
-    return lines + ([result.advice_trials.text] if result.advice_trials is not None else [])
+def _advice_blocks(result: FitResult) -> list[list[str]]:
+    """Return the changes that lowered the free run's error, and a count of all trials.
+
+    The lines of the first follow it.
+    """
+    lines = [f"Or: {advice.text}" for advice in result.advice[1:ADVISED]]
+    lines += [result.advice_trials.text] if result.advice_trials is not None else []
+    if not result.advice:
+        return [lines]
+    first = result.advice[0]
+    changed = changed_lines(result.spec, first.change)
+    copied = ["Write into the spec, and fit again:", "", *changed] if changed else []
+    return [[f"Next: {first.text}"], copied, lines]
 
 
 def check_text(result: CheckResult) -> str:
@@ -365,7 +373,8 @@ def _bias_table(rows: Sequence[ParameterResult]) -> list[str]:
         value, bias = row.value or 0.0, row.bias.value if row.bias else None
         bias = _round_share((bias or 0.0) / (value or 1.0)) * (value or 1.0)
         errors = plain_number(abs(bias) / row.std) if row.std else "–"
-        part = percent(_round_share(bias / value), sign="+") if value else "–"
+        share = row.share_of_bias
+        part = "–" if share is None else percent(_round_share(share), sign="+")
         known = row.bias is None or row.bias.determined
         cells.append(
             [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from orthaug._base.lines import percent
 from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression
 from orthaug.data.record import Record
+from orthaug.data.spec_lines import toml_value
 from orthaug.data.terms import CONSTANT
 from orthaug.data.writing import coefficient_unit
 from orthaug.models.model import Model
@@ -64,9 +64,9 @@ class NewTerm:
     scale: Expression | None = None
 
     @property
-    def has_form(self) -> bool:
-        """True of all but a constant: another form might explain the learner as well."""
-        return self.text != "1"
+    def selected(self) -> bool:
+        """True for a form that others could replace; a constant has no other form."""
+        return self.text != CONSTANT
 
 
 def names_for(kinds: Sequence[str], taken: Sequence[str]) -> list[str]:
@@ -104,7 +104,7 @@ def added_to_baseline(
             initial=one.coefficient,
             unit=one.unit or "",
             output=one.added_to if several else None,
-            selected=one.has_form,
+            selected=one.selected,
         )
         for one in added
     ]
@@ -118,12 +118,12 @@ def baseline_lines(added: Sequence[NewTerm], several: bool) -> str:
         entries = {"parameter": one.name, "regressor": one.text, "initial": _short(one.coefficient)}
         entries |= {"unit": one.unit} if one.unit else {}
         entries |= {"output": one.added_to} if several else {}
-        entries |= {"selected": True} if one.has_form else {}
+        entries |= {"selected": True} if one.selected else {}
         blocks.append(
             "\n".join(
                 [
                     "[[baseline.terms]]",
-                    *(f"{key} = {_toml(value)}" for key, value in entries.items()),
+                    *(f"{key} = {toml_value(value)}" for key, value in entries.items()),
                 ]
             )
         )
@@ -140,7 +140,7 @@ class ChangedMotion:
 
     def lines(self) -> str:
         """Return the lines to change in a spec."""
-        blocks = [f"[{table}]\n{key} = {_toml(text)}" for table, key, text in self.equations]
+        blocks = [f"[{table}]\n{key} = {toml_value(text)}" for table, key, text in self.equations]
         rows = []
         for one in self.parameters:
             entries = {"initial": _short(one.initial)} | ({"unit": one.unit} if one.unit else {})
@@ -148,7 +148,7 @@ class ChangedMotion:
             entries |= {"selected": True} if one.selected else {}
             rows.append(
                 f"{one.name} = {{ "
-                f"{', '.join(f'{key} = {_toml(value)}' for key, value in entries.items())} }}"
+                f"{', '.join(f'{key} = {toml_value(value)}' for key, value in entries.items())} }}"
             )
         return "\n\n".join([*blocks, "\n".join(["[motion.parameters]", *rows])])
 
@@ -192,8 +192,8 @@ def added_to_motion(
             texts[one.added_to] = f"({inside['inner']}{summand})/{inside['by']}"
         else:
             texts[one.added_to] = f"{text}{summand}"
-        found = one.name, factor * coefficient, unit or ""
-        new.append(PhysicalParameter(*found, selected=one.has_form))
+        start_value = factor * coefficient
+        new.append(PhysicalParameter(one.name, start_value, unit or "", selected=one.selected))
     changed = Motion.from_equations(
         states=[replace(state, derivative=texts[state.name]) for state in motion.states],
         outputs=[replace(output, expression=texts[output.name]) for output in motion.outputs],
@@ -254,11 +254,6 @@ def _is_balanced(text: str) -> bool:
 def _short(value: float) -> float:
     """Return the value to six digits, as accurate as the learner is."""
     return float(f"{value:.6g}")
-
-
-def _toml(value: object) -> str:
-    text = isinstance(value, str | bool)
-    return json.dumps(value, ensure_ascii=False) if text else repr(value)
 
 
 LEAST = 0.005
