@@ -57,8 +57,9 @@ _LEARN = (
     "names them."
 )
 _ELSEWHERE = (
-    "The learner that was tried does not explain it: let it see other signals, or add it to other "
-    "equations or outputs; or search for missing terms with `[[suspects]]`."
+    "The learner that was tried does not lower the error on held-out rows: let it see other "
+    "signals, or add it to other equations or outputs. Or search for missing terms with "
+    "`[[suspects]]`."
 )
 _REMEDIES = (_SEARCH, _LEARN, _ELSEWHERE)
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
