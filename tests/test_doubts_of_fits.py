@@ -170,6 +170,7 @@ def test_time_constants_that_may_change_places_are_named(outputs):
             part.split(" = ") for part in text.split("with ")[1].split(". ")[0].split(", ")
         )
         assert float(values["T1"]) == pytest.approx(1.5, rel=0.05)
+        assert "the fitted values of T1 and T2 in another order" in text
         assert float(values["T2"]) == pytest.approx(0.3, rel=0.05)
 
 
