@@ -861,3 +861,20 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
         "imitates a and b; other forms of the term that fit as well count in their intervals."
     )
     assert "does not surely improve it, and which is as good without the learner." in trials.text
+
+
+def test_a_change_that_is_surely_worse_is_said_to_be():
+    """Samples at a rim, marked as missing, made the free run of the tanks eight times worse."""
+    base = [1e-3 * np.random.default_rng(5).uniform(0.5, 1.5, 60)]
+    record = oa.Record.from_arrays([0.0] * 9, [0.0] * 9)
+    rows = ValidationRows(record, record, None, "rows held out", "")
+
+    def text_on(*factors: float) -> str:
+        tried = [ProposalErrors(Proposal("a step", {}), [factor * base[0]]) for factor in factors]
+        return _conclude_trials(base, tried, rows, 0, True, slow=False)[1].text
+
+    assert text_on(4.0).endswith(
+        "a step (0.0633, surely worse). Do not make a change that is surely worse, even where a "
+        "text above advises it."
+    )
+    assert "worse" not in text_on(1.0)

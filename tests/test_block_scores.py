@@ -187,7 +187,11 @@ def test_errors_that_remember_for_too_long_have_no_interval():
     assert fit.std is None and fit.interval is None and fit.std_kind == "none"
     np.testing.assert_array_equal(fit.plain_covariance, plain.covariance)
     text = dict(fit.warnings)["too_long_memory"]
-    assert "no standard errors and no intervals" in text and "longer segments" in text
+    assert "no standard errors and no intervals" in text and text.endswith(
+        "Use a longer record, or physics with smaller errors."  # segments are whole experiments
+    )
+    segmented = dict(default(flown(0, 0.9, 90, 180)).warnings).get("too_long_memory", "")
+    assert "Use longer segments, a longer record" in segmented
     assert "std         none" in fit.summary()
     split = fit.split(Symmetrized())
     assert split.std is None and split.interval is None

@@ -28,6 +28,16 @@ def tanh_friction(rows: int = 800) -> oa.Record:
 PHYSICS = [oa.Term("a1", "y[k-1]"), oa.Term("a2", "y[k-2]"), oa.Term("b", "u[k-1]")]
 
 
+def test_a_selected_term_of_the_wrong_form_is_no_learner():
+    """The sentence on intervals that are withheld spoke of a learner where there was none."""
+    selected = oa.Term("r", "(y[k-1] - y[k-2])**3", selected=True)
+    physics = oa.Baseline.from_terms([*PHYSICS, selected])
+    fit = oa.estimate(tanh_friction(), physics, learner=None, criterion=oa.Prediction())
+    found = {warning.code: warning.text for warning in fit.diagnose().warnings}
+    assert "The learner holds" not in found["unexplained"]
+    assert "lacks something whose bias is not known, so no interval" in found["unexplained"]
+
+
 def test_a_learner_of_the_wrong_form_gives_no_interval_with_bias():
     """It explains itself wholly, and nothing of what it cannot hold."""
     learner = oa.Terms(terms=("(y[k-1]-y[k-2])**3",))
@@ -160,6 +170,7 @@ def test_time_constants_that_may_change_places_are_named(outputs):
             part.split(" = ") for part in text.split("with ")[1].split(". ")[0].split(", ")
         )
         assert float(values["T1"]) == pytest.approx(1.5, rel=0.05)
+        assert "the fitted values of T1 and T2 in another order" in text
         assert float(values["T2"]) == pytest.approx(0.3, rel=0.05)
 
 

@@ -416,6 +416,20 @@ def test_restarts_are_chosen_by_the_loss_of_the_free_run():
     np.testing.assert_array_equal(several.theta, alone[best].theta)
 
 
+def test_a_converged_run_is_chosen_where_one_at_its_limit_is_hardly_better():
+    """Parameters of a run that stopped at its limit have no intervals."""
+    options = {"learner": NETWORK, "criterion": FREE, "regularization": "evidence"}
+    solver = LevenbergMarquardt(45)
+    fit = estimate(
+        record(), PHYSICS, restarts=4, seed=4, validation=record(9), solver=solver, **options
+    )
+    chosen = next(run for run in fit.restarts if run.chosen)
+    least = min(fit.restarts, key=lambda run: run.validation)
+    assert (least.code, chosen.code) == ("iteration_limit", "converged")
+    assert 1 < chosen.validation / least.validation < 1.02**2
+    assert fit.std is not None
+
+
 def test_validation_chooses_by_the_free_run():
     options = {
         "learner": NETWORK,

@@ -125,7 +125,10 @@ def test_a_learner_that_was_dropped_is_no_remedy():
     )
     text = {one.code: one.text for one in fit.diagnose(blocks=0).warnings}
     assert "physics_alone" in text
-    assert "The learner that was tried does not explain it" in text["unexplained"]
+    assert (
+        "The learner that was tried does not lower the error on held-out rows"
+        in text["unexplained"]
+    )
     assert "Fit with a learner" not in text["unexplained"]
 
 

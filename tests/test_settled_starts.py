@@ -1,4 +1,4 @@
-"""Segments whose starts followed the parameters into a minimum of their own begin anew."""
+"""Starts by least squares on measured rows: of segments in training, and of predictions."""
 
 from __future__ import annotations
 
@@ -57,3 +57,22 @@ def test_a_learner_beside_them_reaches_the_noise(record):
         record, pendulum(20.0, 0.1), learner=oa.MLP(hidden=(4,), inputs=("om",)), seed=0
     )
     assert np.sqrt(fit.status.loss) < 0.03  # of the deviation, where the noise is 0.016
+
+
+def test_a_prediction_does_not_depend_on_how_many_others_are_made() -> None:
+    """Windows run side by side in groups of one program: 150, 65 and 20 of them agree."""
+    y = decay(170)
+    fit = oa.estimate(
+        oa.Record.from_arrays(np.zeros((170, 0)), y, sampling_time=STEP),
+        pendulum(20.0, 0.1),
+        learner=None,
+        solver=oa.LevenbergMarquardt(3),
+    )
+
+    def predict(rows: int) -> np.ndarray:
+        record = oa.Record.from_arrays(np.zeros((rows, 0)), y[:rows], sampling_time=STEP)
+        return np.asarray(fit.model.predict(record).model)
+
+    every = predict(170)
+    for rows in (85, 40):
+        np.testing.assert_allclose(predict(rows), every[: len(predict(rows))], atol=1e-9)

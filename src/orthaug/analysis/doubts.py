@@ -57,8 +57,9 @@ _LEARN = (
     "names them."
 )
 _ELSEWHERE = (
-    "The learner that was tried does not explain it: let it see other signals, or add it to other "
-    "equations or outputs; or search for missing terms with `[[suspects]]`."
+    "The learner that was tried does not lower the error on held-out rows: let it see other "
+    "signals, or add it to other equations or outputs. Or search for missing terms with "
+    "`[[suspects]]`."
 )
 _REMEDIES = (_SEARCH, _LEARN, _ELSEWHERE)
 _OWN_PAST = 0.5  # of the residual's variance, at least, in a disturbance with a memory
@@ -96,7 +97,7 @@ def doubt(made: E) -> E:
         warnings.append(
             Warning(
                 code="unexplained",
-                text=_unexplained_text(test, left, fit, result) + _withdrawal(result, left),
+                text=_unexplained_text(test, left, fit, result) + _withdrawal(fit, result, left),
             )
         )
     hidden = test is not None and test.has_memory and (left <= _LEFT or test.exceeds(left))
@@ -157,16 +158,17 @@ def _named_share(result: Findings) -> float:
     return max((term.share or 0.0 for term in missing.terms), default=0.0) if missing else 0.0
 
 
-def _withdrawal(result: Findings, left: float) -> str:
+def _withdrawal(fit: Any, result: Findings, left: float) -> str:
     """Return a sentence on the intervals with bias that are not given; empty for none."""
     rows = [*(result.parameters or ()), *(result.physical_parameters or ())]
     names = [row.name for row in rows if row.bias is not None]
     if left <= _LEFT or not names:
         return ""
-    return (
-        " The learner holds only a part of what the physics lacks, so no interval with its bias is "
-        f"given for {', '.join(names[:_NAMED])}"
-        + (f" and {len(names) - _NAMED} more." if len(names) > _NAMED else ".")
+    lacks = "The learner holds only a part of what the physics lacks"
+    if not fit.learns:
+        lacks = "The physics still lacks something whose bias is not known"
+    return f" {lacks}, so no interval with its bias is given for {', '.join(names[:_NAMED])}" + (
+        f" and {len(names) - _NAMED} more." if len(names) > _NAMED else "."
     )
 
 

@@ -7,12 +7,14 @@ minimum. No standard error shows either.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning
+from orthaug._base.lines import join_words
 from orthaug.analysis.input_timing import residual_of
 from orthaug.analysis.motion_identifiability import information
 from orthaug.fitting.motion_task import (
@@ -30,6 +32,7 @@ from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 _AS_GOOD = 1e-3  # of the residual: as good
 _BETTER = 0.02  # of the residual: clearly better
 _INTEGRATED = 0.1  # of the residual: how far half the step may move the outputs of another solution
+_SAME_VALUE = 0.02  # of a parameter: as close are the ends of two descents along a flat direction
 _APART = 10.0  # standard errors by the curvature of the fit: another minimum, not a flat one
 
 
@@ -43,6 +46,8 @@ class OtherSolution:
     parameters: dict[str, float]
     residual: float
     fitted: float
+    exchanged: tuple[str, ...] = ()
+    """Parameters whose values the two solutions have in another order; () for other values."""
 
     @property
     def better(self) -> bool:
@@ -61,8 +66,14 @@ class OtherSolution:
                 "exclude them."
             )
             return (Warning("local_minimum", text),)
+        which = ""
+        if self.exchanged:
+            which = (
+                f" These are the fitted values of {join_words(self.exchanged)} in another order, "
+                "as of parts that change places: the initial values decide which is which."
+            )
         text = (
-            f"physics alone explains the data equally well with {values}. The result is the "
+            f"physics alone explains the data equally well with {values}.{which} The result is the "
             "solution next to the initial values; give bounds or better initial values to choose "
             "one."
         )
@@ -105,7 +116,22 @@ def find_other_solution(
     residual, best = min(found, key=lambda one: one[0])
     p = coordinates.physical(best.end.point.theta)
     names = segmented.problem.motion.names
-    return OtherSolution(dict(zip(names, map(float, p), strict=True)), residual, fitted)
+    exchanged = _exchanged(names, coordinates.physical(base.end.point.theta), p)
+    return OtherSolution(dict(zip(names, map(float, p), strict=True)), residual, fitted, exchanged)
+
+
+def _exchanged(names: Sequence[str], fitted: Vector, other: Vector) -> tuple[str, ...]:
+    """Return the parameters that have each other's values, where all others have their own."""
+    left, moved = list(range(len(names))), []
+    for i, value in enumerate(other):
+        alike = [j for j in left if abs(value - fitted[j]) <= _SAME_VALUE * abs(fitted[j])]
+        if not alike:
+            return ()
+        taken = i if i in alike else alike[0]
+        left.remove(taken)
+        if taken != i:
+            moved.append(names[i])
+    return tuple(moved)
 
 
 def _is_of_the_equations(own: SegmentedMotion, other: FreeRunFit) -> bool:

@@ -210,7 +210,9 @@ def _too_long(fit: Any) -> Any:
             f"over more than a segment of training ({fit.scores.longest} steps) or much of the "
             "record"
         )
-    return _withheld(fit, "of the free run", why, "longer segments, ")
+    trained = fit.criterion.free_run
+    whole = trained is None or not trained.steps
+    return _withheld(fit, "of the free run", why, "" if whole else "longer segments, ")
 
 
 def _withheld(fit: Any, errors: str, why: str, longer: str = "") -> Any:

@@ -63,6 +63,7 @@ _CHANCE = (
 )
 _NONE_TRIED = AdviceTrialsResult(text="No change of the spec was tried.", tried=0, not_tried=0)
 _LISTED = 3  # changes without gain that the text names
+_NOT_TO_BE_MADE = "Do not make a change that is surely worse, even where a text above advises it."
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,11 +370,12 @@ def _conclude_trials(
     )
     if worse:
         named = "; ".join(
-            f"{one.proposal.words} ({_error_text(one, _before(one, base))})"
-            for one in worse[:_LISTED]
+            f"{one.proposal.words} ({_error_text(one, base)})" for one in worse[:_LISTED]
         )
         more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
         text += f" No sure gain over {_error(before)}: {named}{more}."
+        if any(_hurts(one, base) for one in worse[:_LISTED]):
+            text += f" {_NOT_TO_BE_MADE}"
     if left:
         text += (
             f" {plural(left, 'change')} {'was' if left == 1 else 'were'} not tried, to save time."
@@ -489,13 +491,22 @@ def _freed_text(names: Sequence[str]) -> str:
     )
 
 
-def _error_text(one: ProposalErrors, before: float) -> str:
+def _hurts(one: ProposalErrors, base: Pieces) -> bool:
+    """Return whether a change surely raises the error."""
+    return one.pieces is not None and (
+        _ratio(one, base if one.base is None else one.base).code == "hurts"
+    )
+
+
+def _error_text(one: ProposalErrors, base: Pieces) -> str:
     """Return the error of a change without sure gain, and why a much lower one is not sure."""
     if one.pieces is None:
         return "no fit"
     if math.isinf(one.error):
         return "diverges"
-    lower = one.error < _MUCH_LOWER * before and one.error <= _NO_BETTER
+    if _hurts(one, base):
+        return f"{_error(one.error)}, surely worse"
+    lower = one.error < _MUCH_LOWER * _before(one, base) and one.error <= _NO_BETTER
     return _error(one.error) + (", lower, but not surely on other rows" if lower else "")
 
 

@@ -497,7 +497,7 @@ class MotionTask(SimulationTask):
         if not self.bound.learns or run.ending is Ending.STOPPED or run.end.linear is None:
             return self, run
 
-        looking = solver.within_limit.until(NOTICEABLE / self.plan.residuals)
+        looking = solver.until(NOTICEABLE / self.plan.residuals)
 
         def go_on(finer: SegmentedMotion, before: FreeRunFit) -> FreeRunFit | None:
             again = _descend_on(looking, finer, before, structure, ridge=run.end.ridge)

@@ -19,6 +19,7 @@ from orthaug._base.progress import LOG, ProgressCallback, Stage, show_model
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.held_out import (
+    WORTH,
     HeldOutErrors,
     Pieces,
     covered_folds,
@@ -164,7 +165,10 @@ def train(
     )
     ranking = choice.ranking(task, runs, errors)
     usable = np.array([run.ending.usable for run in runs]) & np.isfinite(ranking)
-    best = int(np.argmin(np.where(usable, ranking, np.inf)))
+    ranking_of_usable = np.where(usable, ranking, np.inf)
+    best = int(np.argmin(ranking_of_usable))
+    if np.isfinite(errors).any():
+        best = _converged_beside(best, runs, ranking_of_usable)
     replacing = []
     if held_out is not None:
         held_out = replace(held_out, chosen=best)
@@ -210,6 +214,19 @@ def train(
     beside = _physics_to_compare(task, structure) if best >= 0 and not briefly else None
     found = {"restarts": restarts, "status": status, "held_out": held_out, "physics_alone": beside}
     return replace(estimate, **found, warnings=warnings)
+
+
+def _converged_beside(best: int, runs: Sequence[FinishedRun], errors: np.ndarray) -> int:
+    """Return the best run by mean squares, or one that converged where it is hardly worse.
+
+    A run that stopped at its limit has parameters without intervals.
+    """
+    if runs[best].ending is not Ending.RUNNING:
+        return best
+    ended = np.array([run.ending is not Ending.RUNNING for run in runs])
+    others = np.where(ended, errors, np.inf)
+    other = int(np.argmin(others))
+    return other if others[other] <= (1 + WORTH) ** 2 * errors[best] else best
 
 
 def _physics_to_compare(task: Task, structure: Structure) -> Estimate | None:

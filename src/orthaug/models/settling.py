@@ -21,6 +21,9 @@ from orthaug.models.dynamics import Dynamics, Numbers
 LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 128, 16  # steps, and windows side by side
+# Windows side by side at most: of 128, JAX hands each small operation of a step to threads, which
+# takes three times the time
+_MOST_LANES = 64
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
 _FEWEST = 8  # steps where each padded row is a call of the host
@@ -90,11 +93,46 @@ def settle(
         enough: the relative decrease that is not worth a step.
     """
     count = np.shape(states)[1]
-    lanes = _padded_lanes(count, form.calls_host)
-    begun = np.pad(np.asarray(states, dtype=float), ((0, 0), (0, lanes - count)), mode="edge")
+    groups = np.array_split(np.arange(count), max(1, -(-count // _MOST_LANES)))
+    lanes = _padded_lanes(len(groups[0]), form.calls_host)  # one program for all of them
+    found = [
+        _settle_together(
+            form,
+            numbers,
+            np.asarray(states, dtype=float)[:, own],
+            Windows(*(np.asarray(part)[..., own] for part in windows)).pad(
+                lanes, every_row=form.calls_host
+            ),
+            weight,
+            np.asarray(loose, dtype=float),
+            (iterations, enough),
+        )
+        for own in groups
+    ]
+    best, misfit = zip(*found, strict=True)
+    return np.concatenate(best, axis=1), np.concatenate(misfit)
+
+
+def _settle_together(
+    form: Dynamics,
+    numbers: Numbers,
+    states: Float[np.ndarray, "n0 m"],
+    layout: tuple[Windows, int],
+    weight: Matrix,
+    loose: Vector,
+    until: tuple[int, float],
+) -> tuple[Float[np.ndarray, "n0 m"], Vector]:
+    """Return the states of windows that one program runs side by side, and their misfits (m,).
+
+    Args:
+        layout: the windows, padded to its lanes, and their steps.
+        until: iterations at most, and the relative decrease that is not worth a step.
+    """
+    (iterations, enough), count = until, states.shape[1]
+    lanes = np.shape(layout[0].scored)[1]
+    begun = np.pad(states, ((0, 0), (0, lanes - count)), mode="edge")
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
-        prior = 1 / np.asarray(loose, dtype=float) ** 2
-    layout = windows.pad(lanes, every_row=form.calls_host)  # once for all iterations
+        prior = 1 / loose**2
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
     matrix, right, misfit = _linearise_windows(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
