@@ -21,8 +21,7 @@ from orthaug.models.dynamics import Dynamics, Numbers
 LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 128, 16  # steps, and windows side by side
-# Windows side by side at most: a step of 128 takes two to three times as long for each of them, as if
-# each of its small operations went to threads
+# Windows side by side at most: a step of 128 takes two to three times as long for each of them
 _MOST_LANES = 64
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
