@@ -319,12 +319,13 @@ def _fold(line: str, width: int) -> list[str]:
     return [part.replace(_UNBROKEN, " ") for part in wrapped]
 
 
-def join_blocks(blocks: Iterable[Sequence[str]]) -> str:
-    """Return blocks of folded lines with empty lines between them.
+class Copied(tuple[str, ...]):
+    """A block of lines that are to be copied: folded they would be no lines of a file."""
 
-    A block that contains an empty line is to be copied, and stays as it is.
-    """
-    folded = (lines if "" in lines else fold(lines) for lines in blocks if lines)
+
+def join_blocks(blocks: Iterable[Sequence[str]]) -> str:
+    """Return blocks of lines with empty lines between them, folded but for those to be copied."""
+    folded = (lines if isinstance(lines, Copied) else fold(lines) for lines in blocks if lines)
     return "\n\n".join("\n".join(lines) for lines in folded)
 
 

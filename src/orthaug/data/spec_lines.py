@@ -8,7 +8,7 @@ from typing import Any
 
 
 def toml_value(value: object) -> str:
-    """Return a value as it is written behind a key of a TOML file.
+    """Return a value as it is written behind a key of a TOML file, a number with six digits.
 
     Examples:
         >>> print(toml_value({"derivative": "v", "learned": True}))
@@ -19,6 +19,8 @@ def toml_value(value: object) -> str:
         return f"{{ {', '.join(rows)} }}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, float):
+        return repr(float(f"{value:.6g}"))
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
 
 

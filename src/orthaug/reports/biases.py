@@ -16,6 +16,7 @@ from orthaug._base.lines import percent, plain_number, plural
 from orthaug.analysis.causes import SURE_SHARE
 from orthaug.analysis.findings import NO_GUESS, SuspectResult
 from orthaug.analysis.fit_findings import ParameterResult
+from orthaug.reports import page_blocks
 
 REMOVED_BY = (
     "Removed by: a measure, if some weighting of these points leaves none; the learner, if it sees "
@@ -98,7 +99,7 @@ def size_of_bias(rows: Sequence[ParameterResult]) -> str:
         return ""
     times = f"{plain_number(worst.errors_of_bias)} times its standard error"
     relative = worst.share_of_bias
-    share = "" if relative is None else percent(relative, sign="+")
+    share = "" if relative is None else page_blocks.percent(relative, signed=True)
     size = f"{share}, {times}" if share else times
     return f" by about {size}" if len(rows) == 1 else f", {worst.name} by about {size}"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from orthaug._base.content import Flag, Number, Whole
 from orthaug._base.errors import Warning
-from orthaug._base.lines import continued, fold, join_blocks, percent, table
+from orthaug._base.lines import Copied, continued, fold, join_blocks, percent, table
 from orthaug.analysis.findings import MemoryResult
 from orthaug.reports.result import ResultHeader
 from orthaug.selection.explanation import ExplainingTerm, MovedParameter, SingleTerm
@@ -52,7 +52,7 @@ def explain_text(result: ExplainResult) -> str:
         rows += [[_percent(one.share), one.equation, one.name] for one in result.memory[:_MEMORY]]
         blocks.append(table(continued(rows)))
     if result.spec is not None:
-        blocks.append(["Write into the spec, and fit again:", "", *result.spec.splitlines()])
+        blocks += [["Write into the spec, and fit again:"], Copied(result.spec.splitlines())]
     elif result.terms:
         blocks.append(["The physics is a Python function: add the terms there, and fit again."])
     blocks.append([f"warning: {warning.text}" for warning in result.warnings])

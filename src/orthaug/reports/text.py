@@ -11,6 +11,7 @@ import numpy as np
 from orthaug._base.errors import Warning
 from orthaug._base.lines import (
     INTERVAL_HEAD,
+    Copied,
     continued,
     cut,
     estimate_cells,
@@ -99,7 +100,7 @@ def _withdraw_claim(line: str, result: Findings) -> str:
     return line
 
 
-def _advice_blocks(result: FitResult) -> list[list[str]]:
+def _advice_blocks(result: FitResult) -> list[Sequence[str]]:
     """Return the changes that lowered the free run's error, and a count of all trials.
 
     The lines of the first follow it.
@@ -110,8 +111,8 @@ def _advice_blocks(result: FitResult) -> list[list[str]]:
         return [lines]
     first = result.advice[0]
     changed = changed_lines(result.spec, first.change)
-    copied = ["Write into the spec, and fit again:", "", *changed] if changed else []
-    return [[f"Next: {first.text}"], copied, lines]
+    remedy = ["Write into the spec, and fit again:"] if changed else []
+    return [[f"Next: {first.text}"], remedy, Copied(changed), lines]
 
 
 def check_text(result: CheckResult) -> str:
