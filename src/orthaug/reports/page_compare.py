@@ -12,7 +12,7 @@ from orthaug.models.response import Response
 from orthaug.reports.page_blocks import Grid, Section, Table, Text, interval, number
 from orthaug.reports.page_figures import parameter_comparison
 from orthaug.reports.page_fit import (
-    BIAS_TOLD,
+    BIAS_CAPTION,
     Origin,
     bias_cell,
     origin_blocks,
@@ -166,7 +166,7 @@ def _parameters(result: CompareResult) -> list[Any]:
         *(["bias"] if biased else []),
         *([f"less {result.comparison[0].name}", "in standard errors"] if apart else []),
     ]
-    caption = f"What each model estimates.{BIAS_TOLD if biased else ''}"
+    caption = f"What each model estimates.{BIAS_CAPTION if biased else ''}"
     if apart:
         caption += (
             " Differences are from the first model, also over the larger standard error of both: a "

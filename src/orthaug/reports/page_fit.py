@@ -38,7 +38,7 @@ from orthaug.reports.page_learned import learned_blocks
 from orthaug.reports.page_runs import Run, error_band, run_plots
 from orthaug.reports.result import CompareResult, DataResult, FitResult
 
-BIAS_TOLD = (
+BIAS_CAPTION = (
     " The bias is the estimate minus the true value, as far as one suspected term explains "
     "what the learner found."
 )
@@ -145,8 +145,8 @@ def _parameters(result: FitResult) -> list[Any]:
         caption += (
             " A unit in brackets is not in the spec: it follows from the units of the channels."
         )
-    if biased:
-        caption += f"{BIAS_TOLD[:-1]};"
+    if biased_by(rows):
+        caption += f"{BIAS_CAPTION[:-1]};"
         caption += (
             " the interval with the bias is the hull over all causes that noise cannot distinguish."
         )
