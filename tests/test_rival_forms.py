@@ -110,9 +110,21 @@ def test_a_sharp_form_leaves_the_intervals_alone():
     assert np.ptp(with_forms) <= 1.2 * np.ptp(own)
 
 
+def test_a_form_that_is_like_no_other_has_no_rivals():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-9, 9, 400), np.zeros(400)
+    for k in range(1, 400):
+        y[k] = 0.5 * y[k - 1] + 0.1 * u[k - 1] + np.sin(5 * u[k - 1]) + 0.01 * rng.normal()
+    record = oa.Record.from_arrays(u, y, inputs=["u"], outputs=["y"], sampling_time=1.0)
+    terms = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]")]
+    wave = oa.Term("s", "sin(5*u[k-1])", selected=True)
+    fit = oa.estimate(record, oa.Baseline.from_terms([*terms, wave]), learner=None)
+    assert rival_forms(linearization_of(fit, Training())) == ([], [])
+
+
 def test_a_form_has_one_name():
     fit = fitted(heated("radiation", 3), "T[k-1]**3", selected=True)
-    names = [rival.name for rival in rival_forms(linearization_of(fit, Training()))]
+    names = [rival.name for rival in rival_forms(linearization_of(fit, Training()))[0]]
     assert len(names) == len(set(names))
     assert "T[k-1]**3.5" in names  # of what is never negative no sign is written
     assert not any("sign" in name or "abs" in name for name in names)
@@ -142,7 +154,9 @@ def fitted_cell():
 
 def test_a_logarithm_is_a_form_of_what_is_positive():
     fit = fitted_cell()
-    assert "log(I[k-1])" in [rival.name for rival in rival_forms(linearization_of(fit, Training()))]
+    assert "log(I[k-1])" in [
+        rival.name for rival in rival_forms(linearization_of(fit, Training()))[0]
+    ]
     own, with_forms = intervals(fit, "u0")
     assert not own[0] <= 0.12 * 0.95 <= own[1]
     assert with_forms[0] <= 0.12 * 0.95 <= with_forms[1]

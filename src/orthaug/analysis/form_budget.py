@@ -37,7 +37,10 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     """
     if terms.learned is not None or not any(p.selected for p in terms.fit.problem.parameters):
         return None
-    rivals, alone = rival_forms(terms), _untried(terms)
+    rivals, untried = rival_forms(terms)
+    alone = (
+        _form_alone(untried, "it acts in several equations or is a function") if untried else None
+    )
     if not rivals:
         return Budget((), 1.0, (), (), (alone,)) if alone else None
     fit, value = terms.fit, terms.value
@@ -53,18 +56,6 @@ def budget_by_forms(terms: FormTerms) -> Budget | None:
     rows, physical = (tuple(filter(_is_moved, of)) for of in (rows, physical))
     warnings = [_warning(rivals, terms.names, value, moved, std), alone, *unbounded]
     return Budget((), 1.0, rows, physical, tuple(w for w in warnings if w is not None))
-
-
-def _untried(terms: FormTerms) -> Warning | None:
-    """Return the warning that names selected terms of which no other form can be tried."""
-    fit = terms.fit
-    found = [
-        parameter.name
-        for place, parameter in enumerate(fit.problem.parameters)
-        if parameter.selected and fit.known_std[place] > 0 and terms.forms(place) is None
-    ]
-    why = "it acts in several equations or is a function"
-    return _form_alone(found, why) if found else None
 
 
 def selected_alone(fit: Any, *, forecasts: bool = False) -> list[Warning]:

@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float
 from orthaug._base.checks import Matrix, Vector
 from orthaug.analysis.bias_hull import AS_LIKELY, LEAST
 from orthaug.analysis.free_run_equations import solve_scaled
+from orthaug.analysis.parameter_bias import EstimatedTerms
 
 _MOST_FORMS = 24  # tried in equations of first order: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
@@ -116,28 +117,8 @@ class FormEquations(Protocol):
         ...
 
 
-class SelectedTerms(Protocol):
+class SelectedTerms(EstimatedTerms, Protocol):
     """A fit with terms whose forms were selected: all that differs between kinds of physics."""
-
-    @property
-    def fit(self) -> Any:
-        """The estimate."""
-        ...
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The parameters."""
-        ...
-
-    @property
-    def value(self) -> Vector:
-        """Their values (nθ,)."""
-        ...
-
-    @property
-    def slopes(self) -> Vector:
-        """Derivatives (nθ,) of the parameters by their coordinates."""
-        ...
 
     def forms(self, selected: int) -> Forms[Any] | None:
         """Return other forms of a term; None where none can take its place.
@@ -180,26 +161,32 @@ class RivalForm:
         return close and bool(apart <= _SAME * np.linalg.norm(self.moved))
 
 
-def rival_forms(terms: SelectedTerms) -> list[RivalForm]:
+def rival_forms(terms: SelectedTerms) -> tuple[list[RivalForm], list[str]]:
     """Return the forms that fit as well as those that were selected, the best first.
 
-    Empty without a selected term, and where the coefficient has no standard error.
+    With the coefficients of terms in whose place no other form can be tried. Of a coefficient
+    without a standard error there is neither.
     """
     found: list[RivalForm] = []
+    untried: list[str] = []
     for place, parameter in enumerate(terms.fit.problem.parameters):
         std = terms.fit.known_std[place]
-        if parameter.selected and terms.value[place] != 0 and std > 0:
-            found += _rivals_of(terms, place, float(abs(terms.value[place]) / std))
+        if not (parameter.selected and std > 0):
+            continue
+        forms = terms.forms(place)
+        if forms is None:
+            untried.append(parameter.name)
+        elif terms.value[place] != 0:
+            found += _rivals_among(forms, terms, place, float(abs(terms.value[place]) / std))
     found.sort(key=lambda rival: rival.rise)
-    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))]
+    return [one for k, one in enumerate(found) if not any(map(one.is_same, found[:k]))], untried
 
 
-def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
+def _rivals_among(forms: Forms[Any], terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
     """Return the rivals of one term, whose coefficient is `t` standard errors large."""
     # A form that differs by what noise hides in the fit's equations may differ by more at points
     least = 1 - max(_UNLIKE, min(4 * AS_LIKELY / t**2, _MOST_UNLIKE))
-    forms = terms.forms(place)
-    likely = [] if forms is None else forms.most_alike(least)
+    likely = forms.most_alike(least)
     equations = terms.with_forms(place, [form for form, _ in likely]) if likely else None
     if equations is None:
         return []
@@ -238,7 +225,7 @@ def _rivals_of(terms: SelectedTerms, place: int, t: float) -> list[RivalForm]:
         if alike:
             free[place] = True
             lacks = max(lacks, moved_by(free, gradient)[1] / variance)
-    best = min(0.0, *(rival.rise for rival in found))
+    best = min([0.0, *(rival.rise for rival in found)])
     # No form may be the true one: what the best lacks, another may lack as well
     most = AS_LIKELY * (1 + max(lacks - _BY_CHANCE, 0.0))
     most = max(AS_LIKELY, min(most, (1 - LEAST) * t**2))
