@@ -507,6 +507,7 @@ def test_non_finite(record, learner, structure):
     arguments = {"structure": Additive()} if structure == "additive" else {}
     found = estimate(record, PHYSICS, learner=learner, restarts=2, **arguments)
     assert found.status.code == "non_finite" and not found.status.ok
+    assert found.diagnose(blocks=0).verdict == f"Do not use the model: {found.status.message}"
     assert "the learner returns NaN" in found.status.message and found.status.message in unfolded(
         found.summary()
     )

@@ -53,6 +53,8 @@ def _findings(fit: Any, findings: Any, *, html: bool) -> str:
 def _verdict(findings: Any) -> str:
     from orthaug.reports.page_verdict import fit_verdict
 
+    if not findings.scores:  # training failed
+        return f"Do not use the model: {findings.status.message}"
     verdict = fit_verdict(findings)
     return f"{verdict.trust} {verdict.use}"
 
