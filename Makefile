@@ -30,11 +30,11 @@ long: $(STAMP)  ## run the tests of 16 s or more, which CI leaves out, before a 
 fuzz: $(STAMP)  ## run 3,000 seeded hostile trials and print how many held, by area
 	@$(BIN)/python benchmarks/fuzz.py
 
-check: $(STAMP) docs  ## ruff, pyright, the architecture test and the site of the documents
+check: $(STAMP) docs  ## ruff, pyright, the architecture test, the page of messages and the site of the documents
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/pyright
-	@$(BIN)/python -m pytest -q -m "" tests/test_architecture.py
+	@$(BIN)/python -m pytest -q -m "" tests/test_architecture.py tests/test_messages.py
 
 docs: $(STAMP)  ## build the documents as a site in build/site, to open from disk
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
