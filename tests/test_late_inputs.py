@@ -7,6 +7,8 @@ import pytest
 from test_cli import run
 
 import orthaug as oa
+from orthaug.analysis.input_timing import sort_holds
+from orthaug.physics.motion import HOLDS
 
 
 def chamber(delay, seed=0, rows=1200):
@@ -160,3 +162,23 @@ k = { initial = 1.2, min = 0 }
 [learner]
 kind = "none"
 """
+
+
+_K = np.arange(200)
+
+
+@pytest.mark.parametrize(
+    ("drive", "first"),
+    [
+        (np.sin(_K / 4), "spline"),
+        (np.abs(_K % 40 - 20.0), "first-order"),
+        (np.repeat(np.random.default_rng(0).normal(size=20), 10), "zero-order"),
+        (np.ones(200), "zero-order"),
+        (np.sin(_K[:7]), "zero-order"),
+    ],
+    ids=["smooth", "corners", "steps", "constant", "few rows"],
+)
+def test_the_hold_that_an_input_is_likely_to_follow_is_tried_first(drive, first):
+    """A sensor's smooth record was advised straight lines, at three times a spline's error."""
+    record = oa.Record.from_arrays(u=drive, y=drive)
+    assert sort_holds(record, HOLDS)[0] == first

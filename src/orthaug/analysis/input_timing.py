@@ -125,6 +125,33 @@ def is_stepped(record: Record) -> bool:
     )
 
 
+def sort_holds(record: Record, holds: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the holds, first the one that best predicts each row of the inputs from those around.
+
+    A step predicts it as the row before, straight lines as the mean of its neighbours, a spline as
+    the cubic through the two nearest on each side: (4 (u₋₁ + u₁) - (u₋₂ + u₂))/6. Medians are
+    compared, as steps and corners are few. The longest experiment decides; one of fewer than 8
+    rows, or with a missing input, leaves the order.
+    """
+    inputs = max(record.experiments, key=len).inputs
+    if len(inputs) < 8 or not np.isfinite(inputs).all():
+        return holds
+    spread = np.std(inputs, axis=0)
+    before, near, here, after, far = (
+        inputs[i : len(inputs) - 4 + i] / np.where(spread > 0, spread, 1.0) for i in range(5)
+    )
+    predicted = {
+        "zero-order": near,
+        "first-order": (near + after) / 2,
+        "spline": (4 * (near + after) - (before + far)) / 6,
+    }
+
+    def error(hold: str) -> float:
+        return round(float(np.sum(np.median(np.abs(predicted[hold] - here), axis=0))), 9)
+
+    return tuple(sorted(holds, key=error))
+
+
 def rows_of_trials(problem: MotionProblem) -> int:
     """Return how many rows are tried at most: fewer where each takes many substeps."""
     most = min(ROWS, max(_STEPS // max(problem.substeps, 1), _FEWEST_ROWS))

@@ -11,7 +11,7 @@ from orthaug._base.lines import join_words, plural
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
 from orthaug.analysis.findings import LateInputResult
-from orthaug.analysis.input_timing import is_stepped
+from orthaug.analysis.input_timing import is_stepped, sort_holds
 from orthaug.analysis.wild_rows import wild_row_mendings
 from orthaug.commands.job import MISSING_STATE, Job, declared_output
 from orthaug.commands.parts import training_unit_faults
@@ -463,11 +463,15 @@ def _reads(inputs: tuple[str, ...], variable: str) -> bool:
 
 
 def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the holds of the inputs that are not used yet."""
+    """Yield the holds of the inputs that are not used yet, likely ones first."""
     if result.residuals is None or result.residuals.verdict != "unmodelled":
         return
-    stepped = job.train.source is None and is_stepped(job.train.record)
-    for hold in job.physics.other_holds(job.spec):
-        if stepped and hold != "zero-order":  # it would only fit better by chance
-            continue
+    holds = job.physics.other_holds(job.spec)
+    if job.train.source is None:
+        record = job.train.record
+        if is_stepped(record):  # another one would only fit better by chance
+            holds = tuple(hold for hold in holds if hold == "zero-order")
+        elif len(holds) > 1:
+            holds = sort_holds(record, holds)
+    for hold in holds:
         yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
