@@ -22,7 +22,7 @@ LOOSE = 1e3
 _FIRST_DAMPING = 1e-3
 _SHORTEST, _LANES = 128, 16  # steps, and windows side by side
 # Windows side by side at most: a step of 128 takes two to three times as long for each of them
-_MOST_LANES = 64
+MOST_LANES = 64
 # Steps of few windows: rows that are not gone through cost nothing, and a program one second
 _USUAL = 1024
 _FEWEST = 8  # steps where each padded row is a call of the host
@@ -84,7 +84,8 @@ def settle(
     """Return the states at the windows' first rows that minimise `‖weight e‖²`, and its value (m,).
 
     A window ends where a step promises to lower it by less than the part `enough`: of a 10⁻¹⁰th, a
-    state is within a 10⁻⁵th of its own noise.
+    state is within a 10⁻⁵th of its own noise. Promises fall by a constant factor from step to step,
+    so the last step is the one after which the next would promise less.
 
     Args:
         states: where to begin.
@@ -92,7 +93,7 @@ def settle(
         enough: the relative decrease that is not worth a step.
     """
     count = np.shape(states)[1]
-    groups = np.array_split(np.arange(count), max(1, -(-count // _MOST_LANES)))
+    groups = np.array_split(np.arange(count), max(1, -(-count // MOST_LANES)))
     lanes = _padded_lanes(len(groups[0]), form.calls_host)  # one program for all of them
     found = [
         _settle_together(
@@ -133,12 +134,16 @@ def _settle_together(
     with np.errstate(over="ignore"):  # a start beyond all others has no prior
         prior = 1 / loose**2
     best, damping = begun, np.full(begun.shape[1], _FIRST_DAMPING)
+    before = np.zeros(lanes)  # what the last step that was taken had promised
     matrix, right, misfit = _linearise_windows(form, numbers, begun, layout, weight, begun, prior)
     for _ in range(iterations):
         step = _steps(matrix, right, damping)
         with np.errstate(all="ignore"):
-            ended = (step * right.T).sum(axis=0) <= enough * misfit
-        if ended.all():
+            promise = (step * right.T).sum(axis=0)
+            ended = promise <= enough * misfit
+            last = ~ended & (promise**2 <= enough * misfit * before)
+        if (ended | last).all():
+            best, misfit = np.where(last, best + step, best), misfit - np.where(last, promise, 0.0)
             break
         trial = np.where(ended, best, best + step)
         there = _linearise_windows(form, numbers, trial, layout, weight, begun, prior)
@@ -146,6 +151,7 @@ def _settle_together(
         best = np.where(lower, trial, best)
         matrix = np.where(lower[:, None, None], there[0], matrix)
         right, misfit = np.where(lower[:, None], there[1], right), np.where(lower, there[2], misfit)
+        before = np.where(lower, promise, 0.0)
         damping = np.where(lower, damping / 8, damping * 8)
     return best[:, :count], misfit[:count]
 

@@ -12,7 +12,7 @@ they were measured.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -32,7 +32,7 @@ from orthaug.models.lagged import LaggedDynamics
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.on_records import RecordModel
 from orthaug.models.predictor import predictor_of
-from orthaug.models.settling import LOOSE, Windows, padded_steps, settle
+from orthaug.models.settling import LOOSE, MOST_LANES, Windows, padded_steps, settle
 from orthaug.models.stepping import Memory, checked_row, step_inputs, with_scheme
 from orthaug.physics.innovations import InnovationsModel
 from orthaug.physics.noise import NoiseModel
@@ -364,30 +364,45 @@ class EstimatedStates:
         states, free = self._begin(model, experiment, record, begins)
         sampled = form.motion.discrete_states  # a controller's states follow from the record
         known = np.array([name in sampled for name in form.motion.names_of_states])
-        length, pieces = padded_steps(steps), []  # few horizons have programs of their own
-        for first in range(0, len(begins), _SIDE_BY_SIDE):
-            chosen = begins[first : first + _SIDE_BY_SIDE]
-            more = _SIDE_BY_SIDE - len(chosen)
-            lanes = np.pad(np.arange(first, first + len(chosen)), (0, more), mode="edge")
-            along = begins[lanes][None, :] + np.arange(length)[:, None]
-            along = np.minimum(along, len(inputs) - 1)
-            following = np.moveaxis(inputs[along], -1, 1)
-            target = np.moveaxis(experiment.outputs[along[:window]], -1, 1)
-            windows = Windows(following[:window], target, np.ones((window, len(lanes)), dtype=bool))
-            settled = _settle_from_either(
-                form,
-                numbers,
-                (states[lanes], free[lanes]),
-                windows,
-                model.weight,
-                np.where(known, self.loose * _KNOWN, self.loose),
+        loose = np.where(known, self.loose * _KNOWN, self.loose)
+        length = padded_steps(steps)  # few horizons have programs of their own
+
+        def along(chosen: Vector, lanes: int) -> Vector:
+            """Return the rows (T, m) of windows; some are there twice, so that few m occur."""
+            chosen = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
+            found = begins[chosen][None, :] + np.arange(length)[:, None]
+            return np.minimum(found, len(inputs) - 1)
+
+        def settle_from(guesses: Matrix, chosen: Vector) -> tuple[Matrix, Vector]:
+            own = along(chosen, MOST_LANES)[:window]
+            windows = Windows(
+                np.moveaxis(inputs[own], -1, 1),
+                np.moveaxis(experiment.outputs[own], -1, 1),
+                np.ones(own.shape, dtype=bool),
             )
-            pieces.append(
-                [
-                    np.asarray(last_outputs(*end, settled, following, steps).total).T[: len(chosen)]
-                    for end in ends
-                ]
+            begin = np.pad(
+                guesses[chosen].T, ((0, 0), (0, own.shape[1] - len(chosen))), mode="edge"
             )
+            found, misfit = settle(form, numbers, begin, windows, model.weight, loose, *_UNTIL)
+            return found.T[: len(chosen)], misfit[: len(chosen)]
+
+        settled, misfit = states.copy(), np.empty(len(begins))
+        usual = np.empty_like(misfit)
+        for chosen in _batches(np.arange(len(begins))):
+            settled[chosen], misfit[chosen] = settle_from(states, chosen)
+            usual[chosen] = np.median(misfit[chosen])
+        # A derivative of a noisy output can be so wrong that the run from it leaves
+        for chosen in _batches(np.flatnonzero(misfit > _LOST * usual)):
+            again, other = settle_from(free, chosen)
+            better = other < misfit[chosen]
+            settled[chosen[better]] = again[better]
+        pieces = []
+        for chosen in _batches(np.arange(len(begins))):
+            following = np.moveaxis(inputs[along(chosen, _SIDE_BY_SIDE)], -1, 1)
+            more = following.shape[2] - len(chosen)
+            begin = np.pad(settled[chosen].T, ((0, 0), (0, more)), mode="edge")
+            outputs = [last_outputs(*end, begin, following, steps).total for end in ends]
+            pieces.append([np.asarray(own).T[: len(chosen)] for own in outputs])
         return [np.concatenate(piece) for piece in zip(*pieces, strict=True)]
 
     def _follow(
@@ -482,26 +497,9 @@ class EstimatedStates:
         return points[np.isfinite(points).all(axis=1)]
 
 
-def _settle_from_either(
-    form: MotionDynamics,
-    numbers: Numbers,
-    begins: tuple[Matrix, Matrix],
-    windows: Windows,
-    weight: Matrix,
-    loose: Vector,
-) -> Float[np.ndarray, "nx m"]:
-    """Return the states by which runs follow the windows best, from two guesses (m, nx).
-
-    The second is tried where the first ends far above the others: a derivative of a noisy output
-    can be so wrong that the run from it leaves.
-    """
-    first, second = begins
-    settled, misfit = settle(form, numbers, first.T, windows, weight, loose, *_UNTIL)
-    usual = np.median(misfit)
-    if not (misfit > _LOST * usual).any():
-        return settled
-    again, other = settle(form, numbers, second.T, windows, weight, loose, *_UNTIL)
-    return np.where(other < misfit, again, settled)
+def _batches(rows: Vector) -> Iterator[Vector]:
+    for first in range(0, len(rows), _SIDE_BY_SIDE):
+        yield rows[first : first + _SIDE_BY_SIDE]
 
 
 def _last_of(
