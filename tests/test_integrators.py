@@ -49,7 +49,7 @@ blocks = 0
 class SemiImplicitEuler(Integrator):
     """Each state goes on by the rate at the states after it, which have gone on already."""
 
-    def step(self, field, h, scheme=None, *, looped=False):
+    def step(self, field, h, scheme=None):
         def one(x, first, middle, last):
             for i in reversed(range(len(x))):
                 unit = np.eye(len(x))[i]
@@ -75,7 +75,7 @@ class DormandPrince(Integrator):
     )
     WEIGHTS = (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84)
 
-    def step(self, field, h, scheme=None, *, looped=False):
+    def step(self, field, h, scheme=None):
         def one(x, first, middle, last):
             slopes = []
             for row in self.TABLEAU:

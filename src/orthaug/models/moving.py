@@ -27,7 +27,6 @@ from orthaug.models.learners import nothing_learned
 from orthaug.models.motion_field import MotionField, inputs_along, parts_at
 from orthaug.physics.guessed_motion import guess, layout_of
 from orthaug.physics.integrators import (
-    UNROLLED,
     Exponentials,
     advance,
     input_at,
@@ -37,6 +36,7 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import Coordinates
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
+_FEW, _FEW_LEARNED = 4, 2  # substeps that are one piece; more are a loop, which compiles faster
 _MOST_KEPT = 32  # substeps whose stages are kept in memory until their slopes are multiplied
 _FUSED = 250  # slopes of a state up to which the stages of a step are one piece
 
@@ -81,9 +81,11 @@ def sample_slopes(
     h = pace * form.sampling_time / form.substeps
     # Fused, XLA computes what a stage finds anew for each use of it, of which large slopes have
     # many; and a large field is written once into a program
-    few = form.substeps <= (2 if learned else UNROLLED) and not (form.large and form.substeps > 1)
+    few = form.substeps <= (_FEW_LEARNED if learned else _FEW) and not (
+        form.large and form.substeps > 1
+    )
     over_substeps = _unrolled if few else jax.lax.scan
-    small = form.states * form.unknowns <= _FUSED and not form.large
+    small = few and form.states * form.unknowns <= _FUSED and not form.large
     given = form, numbers, h, _unrolled if small else jax.lax.scan
     end, stages = over_substeps(
         partial(_substep, *given), states, (points[:-2:2], points[1:-1:2], points[2::2])
@@ -426,15 +428,15 @@ class MotionDynamics(MotionField, AutodiffDynamics):
             return sum(self.rates(numbers, state, now))
         exponentials = self.exponentials(numbers) if numbers.scheme is None else numbers.scheme[0]
         inputs, pace = self.split_pace(inputs)
-        h, large = pace * self.sampling_time / self.substeps, self.large
+        h = pace * self.sampling_time / self.substeps
         field = partial(_field, self, numbers)
-        step = self.motion.scheme.step(field, h, exponentials, looped=large)
+        step = self.motion.scheme.step(field, h, exponentials)
         held, external = len(self.motion.held), len(self.motion.external)
         if held:
             points = inputs.reshape(-1, external) if external else inputs.reshape(1, 0)
             control = jnp.broadcast_to(now[:held], (len(points), held))
             inputs = jnp.concatenate([control, points], axis=1).ravel()
-        return advance(step, state, inputs, held + external, self.substeps, looped=large)
+        return advance(step, state, inputs, held + external, self.substeps)
 
     def prepare(self, numbers: Numbers) -> Numbers:
         """Return the numbers with the exponentials of an exact integrator.
