@@ -564,6 +564,31 @@ def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, 
     assert len(warnings) == bool(told) and all(told in w.text for w in warnings)
 
 
+@pytest.mark.parametrize("fault", ["lost rows", "varying steps", "late stamps"])
+def test_a_column_of_uneven_instants_is_a_warning(tmp_path, fault):
+    u, y = plant(100)
+    k, rng = np.arange(100.0), np.random.default_rng(0)
+    stamps = {
+        "lost rows": k + 3 * (k >= 60),
+        "varying steps": np.cumsum(rng.uniform(0.6, 1.4, 100)),
+        "late stamps": k + rng.uniform(0, 0.2, 100),
+    }
+    table = pd.DataFrame({"time": 0.1 * stamps[fault], "u": u, "y": y})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    (tmp_path / "spec.toml").write_text(
+        '[data]\nsampling_time = 0.1\ninputs = ["u"]\noutputs = ["y"]\n'
+        'train = {files = ["a.csv"]}\n'
+        '[[baseline.terms]]\nparameter = "a"\nregressor = "y[k-1]"\n'
+    )
+    found = [
+        w.text
+        for w in load_spec(tmp_path / "spec.toml").warnings
+        if w.code == "other_sampling_time"
+    ]
+    assert len(found) == (fault != "late stamps")
+    assert all('taken as evenly spaced; perhaps time = "time" is meant' in w for w in found)
+
+
 THINNED = [
     (
         "time",

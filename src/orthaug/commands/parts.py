@@ -391,23 +391,30 @@ def _unit_faults(
 def _other_step(
     path: Path, spec: Spec, files: Sequence[str], name: str, sets: Sequence[Mapping[str, str]]
 ) -> tuple[Warning, ...]:
-    """Return a warning where the sampling time of a file differs from that of the spec."""
+    """Return a warning where the instants of a file are not those of the spec's sampling time."""
     used = _used_columns(spec, sets)
     step, given = spec.data.sampling_time or 1.0, spec.data.sampling_time is not None
     for file in files:
         clock = read_clock(path.parent / file, used)
-        if clock.column is None or clock.step is None or abs(clock.step - step) <= DRIFT * step:
+        if clock.column is None or clock.step is None:
+            continue
+        header = clock.column.header
+        remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
+        if clock.uneven:
+            shortest, longest = clock.uneven
+            found = (
+                f"the steps of column '{header}' of {file} are {shortest:.3g} to {longest:.3g} s. "
+                "Its rows are taken as evenly spaced"
+            )
+        elif abs(clock.step - step) > DRIFT * step:
+            found = f"column '{header}' of {file} gives {clock.step:g} s"
+        else:
             continue
         said = (
             f"`sampling_time` is {step:g} s"
             if given
             else "the spec gives no sampling time, so 1 s is used"
         )
-        header = clock.column.header
-        remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
-        text = (
-            f"{name}: {said}, but column '{header}' of {file} gives {clock.step:g} s; perhaps "
-            f"{remedy} is meant."
-        )
+        text = f"{name}: {said}, but {found}; perhaps {remedy} is meant."
         return (Warning("other_sampling_time", text),)
     return ()

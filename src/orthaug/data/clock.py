@@ -107,6 +107,19 @@ class Clock:
         return bool(means) and same_step(min(means), max(means))
 
     @property
+    def uneven(self) -> tuple[float, float] | None:
+        """Shortest and longest step in s, where rows are lost or were taken at uneven instants."""
+        if self.seconds is None or self.step is None:
+            return None
+        instants = self.seconds[np.isfinite(self.seconds)]
+        steps = np.diff(instants)
+        if not len(steps) or not (
+            np.abs(steps - self.step).max() > JITTER * self.step or steps_accumulate(instants)
+        ):
+            return None
+        return float(steps.min()), float(steps.max())
+
+    @property
     def by_name(self) -> bool:
         """True if the name or the dates of the column show that it is the time.
 
