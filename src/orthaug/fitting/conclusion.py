@@ -38,7 +38,6 @@ from orthaug.inference.splitting import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.lagged import LaggedDynamics
-from orthaug.models.learners import Scaling
 from orthaug.models.model import Model, TrainedSegments
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.starts import EstimatedStates
@@ -560,7 +559,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
     segmented = segmented.with_substeps(form.substeps)
     segmented = replace(
         segmented,
-        scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
+        scaling=model.reached,
         unit=np.asarray(numbers.gain),
     )
     states, slope = (_pad_segments(part, segmented) for part in (kept.states, kept.slope))
