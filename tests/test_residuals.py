@@ -9,7 +9,6 @@ import pytest
 import scipy.stats
 from scipy.signal import lfilter
 
-from orthaug import InputError
 from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.analysis.residuals import against_input, against_regressor, analyse
 from orthaug.fitting.whiteness import (
@@ -452,31 +451,3 @@ def test_every_output_has_its_tests_as_plain_content():
         assert content["white"] is test.white and content["ljung_box"]["freedom"] == 25
         assert content["n"] == 500 and sum(content["regressors"]["w"]["counts"]) == 500
         assert content["correlated_inputs"] == list(test.correlated_inputs)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"inputs": []}, "`inputs` has 0 experiments but `residuals` has 1"),
-        ({"residuals": [], "inputs": [], "regressors": []}, "`residuals` has 0 experiments"),
-        (
-            {"inputs": [np.zeros((49, 1))]},
-            r"`inputs` of experiment 0 has the shape \(49, 1\); .* make \(50, 1\)",
-        ),
-        (
-            {"regressors": [np.zeros((50, 2))]},
-            r"`regressors` of experiment 0 has the shape \(50, 2\)",
-        ),
-        ({"residuals": [np.zeros(50)]}, r"`residuals` of experiment 0 has the shape \(50,\)"),
-        ({"output_names": ["y", "y"]}, "'y' is given twice"),
-        ({"lags": 0}, "`lags` must be a whole number, 1 or more"),
-        ({"level": 1.0}, "`level` must be between 0 and 1"),
-        ({"level": 0}, "`level` must be a positive number"),
-    ],
-)
-def test_what_does_not_match_is_refused(change, message):
-    column = [np.zeros((50, 1))]
-    arguments = dict(residuals=column, inputs=column, regressors=column)
-    arguments |= dict(output_names=["y"], input_names=["u"], regressor_names=["x"])
-    with pytest.raises(InputError, match=message):
-        analyse(**(arguments | change))

@@ -19,8 +19,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Int
 
-from orthaug._base.checks import Matrix, Vector, check_count, check_number, check_unique
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment
 from orthaug.fitting.whiteness import (
     LARGEST,
@@ -135,23 +134,14 @@ def analyse(
         lags: of all correlations; cut where the longest experiment is shorter.
         level: of every test; the bands hold one value with probability 1 − level.
 
-    Raises:
-        InputError: experiments, rows or columns that do not match, a name twice, or a setting out
-            of range.
-
     Examples:
         >>> e, u = np.random.default_rng(0).normal(size=(2, 500, 1))
         >>> (test,) = analyse([e], [u], [u], ["y"], ["u"], ["u[k-1]"])
         >>> test.white, test.correlated_inputs, test.curved_regressors
         (True, (), ())
     """
-    lags = check_count(lags, "lags")
-    if not 0 < check_number(level, "level", positive=True) < 1:
-        raise InputError(f"`level` must be between 0 and 1; got {level!r}.")
-    lengths = [len(residual) for residual in residuals]
-    e = _channels(residuals, output_names, "residuals", lengths)
-    u = _channels(inputs, input_names, "inputs", lengths)
-    x = _channels(regressors, regressor_names, "regressors", lengths)
+    e = _channels(residuals, output_names)
+    u, x = _channels(inputs, input_names), _channels(regressors, regressor_names)
     return tuple(_one_output(name, column, u, x, lags, level) for name, column in e.items())
 
 
@@ -201,20 +191,8 @@ def _rejected_tests(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
     return tuple(name for name, value in p.items() if value < level / len(p))
 
 
-def _channels(
-    experiments: Sequence[Matrix], names: Sequence[str], what: str, lengths: Sequence[int]
-) -> Channels:
+def _channels(experiments: Sequence[Matrix], names: Sequence[str]) -> Channels:
     """Return every channel in one piece per experiment, by its name."""
-    check_unique(names, f"`{what}`:")
-    if len(experiments) != len(lengths) or not lengths:
-        raise InputError(
-            f"`{what}` has {len(experiments)} experiments but `residuals` has {len(lengths)}; "
-            "at least 1."
-        )
-    for i, (one, rows) in enumerate(zip(experiments, lengths, strict=True)):
-        if np.shape(one) != (rows, len(names)):
-            shape = f"{np.shape(one)}; its residuals and names make {(rows, len(names))}"
-            raise InputError(f"`{what}` of experiment {i} has the shape {shape}.")
     return {
         name: [np.asarray(one, dtype=float)[:, j] for one in experiments]
         for j, name in enumerate(names)
