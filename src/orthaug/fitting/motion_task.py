@@ -524,14 +524,14 @@ class MotionTask(SimulationTask):
         if not plan.bound.learns:
             return plan
         point = physics.end.point
-        x, u = (part.T for part in plan.physics_only.trajectory(point.c, (), point.states))
+        x, u = plan.physics_only.trajectory(point.c, (), point.states)
         with np.errstate(all="ignore"):
-            features = np.asarray(plan.dynamics.seen(x, u, np)).T
+            features = plan.dynamics.features_at(x, u)
         finite = features[np.isfinite(features).all(axis=1)]
         scaling = scaling_of(
             plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1]))
         )
-        return replace(plan, scaling=scaling, unit=sizes_learned(plan, point.c, x.T, u.T))
+        return replace(plan, scaling=scaling, unit=sizes_learned(plan, point.c, x, u))
 
     def places(
         self,
