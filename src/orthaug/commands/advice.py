@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug._base.lines import join_words, plural
+from orthaug._base.lines import first_words, join_words, plural
 from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
@@ -368,11 +368,8 @@ def _conclude_trials(
         else "."
     )
     if worse:
-        named = "; ".join(
-            f"{one.proposal.words} ({_error_text(one, base)})" for one in worse[:_LISTED]
-        )
-        more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
-        text += f" No sure gain over {_error(before)}: {named}{more}."
+        words = [f"{one.proposal.words} ({_error_text(one, base)})" for one in worse]
+        text += f" No sure gain over {_error(before)}: {first_words(words, _LISTED, '; ')}."
         if any(_hurts(one, base) for one in worse[:_LISTED]):
             text += f" {_NOT_TO_BE_MADE}"
     if left:
