@@ -16,10 +16,12 @@ sys.path.append(str(ROOT / "tests"))
 from test_design import AMPLITUDE, SAMPLES, errors, machine
 
 USUAL = {
-    "white Gaussian": signals.white_gaussian(SAMPLES, amplitude=AMPLITUDE, deviation=33, seed=0),
-    "uniform": signals.white_uniform(SAMPLES, amplitude=AMPLITUDE, seed=0),
-    "binary": signals.white_binary(SAMPLES, amplitude=AMPLITUDE, seed=0),
-    "square of period 6": signals.square(SAMPLES, amplitude=AMPLITUDE, period=6),
+    "white Gaussian": np.clip(
+        np.random.default_rng(0).normal(0.0, 33, SAMPLES), -AMPLITUDE, AMPLITUDE
+    ),
+    "uniform": AMPLITUDE * signals.white_uniform(SAMPLES, 0),
+    "binary": AMPLITUDE * signals.white_binary(SAMPLES, 0),
+    "square of period 6": AMPLITUDE * signals.square(SAMPLES, 6),
 }
 
 

@@ -789,7 +789,7 @@ def test_what_a_better_solution_gains_is_credited_to_no_term(monkeypatch, again,
     change = {"motion.parameters.b.initial": 8.7e-4, "motion.parameters.J.initial": 3e-4}
     made: list[Proposal] = []
 
-    def of(self: Trials, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
+    def of(self: Trials, proposal: Proposal) -> ProposalErrors:
         made.append(proposal)
         return ProposalErrors(proposal, None if math.isnan(again) else errors(again))
 

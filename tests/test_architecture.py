@@ -73,7 +73,6 @@ CONCEPTS = {
     "analysis.verdict_text": "verdicts on residuals, in words",
     "data.matlab": "a reader of MATLAB's v5 files",
     "fitting.innovations": "the gain of a predictor, estimated",
-    "fitting.fit_plans": "what of a fit depends on the kind of physics",
     "fitting.focus": "the choice of `Auto`",
     "fitting.free_run": "training on the free run",
     "fitting.noise_estimation": "coefficients and orders of noise models",

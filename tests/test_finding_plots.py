@@ -116,7 +116,7 @@ def test_errors_over_a_regressor_hold_what_they_say_for_a_coloured_residual():
     rng, beyond = np.random.default_rng(6), []
     for _ in range(200):
         e, x = (lfilter([1.0], [1.0, -0.95], one)[300:] for one in rng.normal(size=(2, 1300)))
-        found = against_regressor(e, x, centred=True)
+        found = against_regressor(e, x)
         beyond.append(np.mean(np.abs(found.means) > 1.96 * found.errors))
     assert 0.03 < np.mean(beyond) < 0.08  # taken as white it would be more than a half
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from orthaug import Baseline, Record, Term
 from orthaug.data.regressors import in_order, stack_rows
-from orthaug.physics.projection import Factor, Projection
+from orthaug.physics.projection import Projection
 
 POLYNOMIAL = ["1", "x[k]", "x[k]**2", "x[k]**3", "x[k]**4", "x[k]**5"]
 NIST = {
@@ -157,139 +157,6 @@ def test_covariance_factor_against_the_exact_inverse():
         exact = mpmath.matrix(stacked.tolist())
         inverse = np.array((exact.T * exact) ** -1, dtype=float).reshape(3, 3)
     np.testing.assert_allclose(factor @ factor.T, inverse, rtol=1e-12)
-
-
-# --- a factor of rows that come in blocks
-
-
-def blocks_of(phi, sizes):
-    """Rows in blocks of the given sizes, one after another and over again."""
-    begin, i = 0, 0
-    while begin < len(phi):
-        yield phi[begin : begin + sizes[i % len(sizes)]]
-        begin, i = begin + sizes[i % len(sizes)], i + 1
-
-
-def upper(factor):
-    """R of the columns as they are, its diagonal not negative: then it is unique."""
-    r = factor.to_coordinates
-    return r * np.where(np.diag(r) < 0, -1.0, 1.0)[:, None]
-
-
-def assert_same_columns(found, expected, relative=1e-13):
-    """Each column (of R, of θ) to the digits of its own size."""
-    size = np.linalg.norm(expected, axis=0)
-    assert np.max(np.abs(found - expected) / np.where(size > 0, size, 1.0), initial=0.0) <= relative
-
-
-@given(SHAPES, st.lists(st.integers(1, 12), min_size=1, max_size=4))
-def test_factor_of_blocks_is_that_of_the_whole(shape, sizes):
-    phi, _ = draw(shape)
-    whole, found = Projection.factor(phi), Factor.of_blocks(blocks_of(phi, sizes))
-    assert found.r.shape == whole.r.shape == (phi.shape[2],) * 2
-    assert np.all(np.log2(found.scale) == np.round(np.log2(found.scale)))
-    np.testing.assert_array_equal(np.tril(found.r, -1), 0.0)
-    assert_same_columns(upper(found), upper(whole))
-    np.testing.assert_allclose(
-        found.covariance_factor() @ found.covariance_factor().T,
-        whole.covariance_factor() @ whole.covariance_factor().T,
-        rtol=1e-10, atol=1e-12 * np.max(np.outer(whole.scale, whole.scale), initial=0.0),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 7, 50, 199, 200, 1000])
-def test_factor_of_blocks_of_any_size(size):
-    """Of fewer rows than columns too, as the first ones of one row are."""
-    phi = np.random.default_rng(0).normal(size=(200, 1, 5)) * [1e-6, 1e-3, 1.0, 1e3, 1e6]
-    assert_same_columns(
-        upper(Factor.of_blocks(blocks_of(phi, [size]))), upper(Projection.factor(phi))
-    )
-
-
-def test_blocks_without_rows_add_nothing():
-    phi = np.random.default_rng(0).normal(size=(20, 2, 3))
-    found = Factor.of_blocks([phi[:0], phi[:12], phi[:0], phi[12:], phi[:0]])
-    assert_same_columns(upper(found), upper(Projection.factor(phi)))
-
-
-@pytest.mark.parametrize("zeros", [[0], [2], [1, 3], [0, 1, 2, 3]])
-@pytest.mark.parametrize("where", ["everywhere", "first block", "all but the last block"])
-def test_blocks_with_columns_of_zeros(zeros, where):
-    """A signal at rest, at first or throughout: the scale of a block is not that of the next."""
-    phi = np.random.default_rng(1).normal(size=(60, 1, 4)) * [1.0, 1e-5, 1e5, 1.0]
-    last = {"everywhere": 60, "first block": 20, "all but the last block": 40}[where]
-    phi[:last, :, zeros] = 0.0
-    found, whole = Factor.of_blocks(blocks_of(phi, [20])), Projection.factor(phi)
-    assert np.isfinite(found.r).all() and np.isfinite(found.scale).all()
-    if where == "everywhere":  # rank-deficient: R is not unique, RᵀR is
-        assert not found.r[:, zeros].any()
-        unit = 1 / np.where(phi.any(axis=(0, 1)), np.linalg.norm(phi[:, 0], axis=0), 1.0)
-        grams = [r.T @ r for r in (found.to_coordinates * unit, whole.to_coordinates * unit)]
-        np.testing.assert_allclose(grams[0], grams[1], rtol=0, atol=1e-14)
-    else:
-        assert_same_columns(upper(found), upper(whole), 1e-12)
-
-
-def test_blocks_without_physics():
-    found = Factor.of_blocks([np.zeros((7, 2, 0)), np.zeros((3, 2, 0))])
-    assert found.r.shape == (0, 0) and found.to_coordinates.shape == (0, 0)
-    assert found.covariance_factor().shape == (0, 0)
-
-
-def test_no_blocks_no_factor():
-    with pytest.raises(ValueError, match="at least one block"):
-        Factor.of_blocks([])
-
-
-def through_blocks(phi, y, sizes):
-    """Least squares from R of `[Φ y]` in blocks, all that stays where the rows do not."""
-    both = Factor.of_blocks(blocks_of(np.concatenate([phi, y[..., None]], axis=2), sizes))
-    nt = phi.shape[2]
-    r = both.to_coordinates
-    return Factor(both.r[:nt, :nt], both.scale[:nt]).from_coordinates(r[:nt, nt])
-
-
-def ill_conditioned(name, rng):
-    """Columns as NIST's are: Wampler's powers up to the fifth, or columns that differ in their last digits."""
-    if name == "powers":
-        phi, beta = (np.arange(21.0) + rng.uniform(size=21))[:, None] ** np.arange(6), np.ones(6)
-    elif name == "a large mean":
-        phi, beta = (
-            np.stack([np.ones(40), 1e7 + rng.normal(size=40)], axis=1),
-            np.array([-3e7, 3.0]),
-        )
-    else:
-        phi = rng.normal(size=(50, 1)) + 1e-6 * rng.normal(size=(50, 4))
-        beta = np.array([1.0, -2.0, 3.0, -4.0])
-    return phi[:, None], beta
-
-
-@pytest.mark.parametrize("sizes", [[1], [4, 9], [21], [1000]], ids=str)
-@pytest.mark.parametrize("name", ["powers", "a large mean", "almost the same"])
-def test_least_squares_through_blocks_has_the_digits_of_qr(name, sizes):
-    """Within a digit on the average of ten draws, one of which is luck: many small blocks round more often."""
-    rng, found, reference = np.random.default_rng(8), [], []
-    for _ in range(10):
-        phi, beta = ill_conditioned(name, rng)
-        y = phi @ beta + 1e-3 * rng.normal(size=(len(phi), 1))
-        with mpmath.workdps(50):
-            exact = mpmath.matrix(phi[:, 0].tolist())
-            certified = list((exact.T * exact) ** -1 * (exact.T * mpmath.matrix(y.tolist())))
-        found.append(digits(through_blocks(phi, y, sizes), certified))
-        reference.append(digits(scaled_qr(phi[:, 0], y[:, 0]), certified))
-    assert np.mean(found) >= np.mean(reference) - 1.0
-
-
-@pytest.mark.parametrize("name", NIST)
-def test_nist_digits_through_blocks(data_folder, name):
-    """On the average of ten orders of the rows: what one order gives is luck, and differs between kinds of BLAS."""
-    phi, y, certified = nist(data_folder, name)
-    rng, found, reference = np.random.default_rng(3), [], []
-    for _ in range(10):
-        order = rng.permutation(len(y))
-        found.append(digits(through_blocks(phi[order], y[order], [5, 3]), certified["beta"]))
-        reference.append(digits(scaled_qr(phi[order, 0], y[order, 0]), certified["beta"]))
-    assert np.mean(found) >= np.mean(reference) - 1.0
 
 
 def test_along_directions_that_the_rows_tell_phi_may_have_columns_of_zeros():

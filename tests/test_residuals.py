@@ -9,7 +9,6 @@ import pytest
 import scipy.stats
 from scipy.signal import lfilter
 
-from orthaug import InputError
 from orthaug.analysis.residual_tests import ResidualTestResult
 from orthaug.analysis.residuals import against_input, against_regressor, analyse
 from orthaug.fitting.whiteness import (
@@ -154,7 +153,7 @@ def test_against_a_white_residual_bins_are_an_analysis_of_variance():
     rng = np.random.default_rng(8)
     e, x = rng.normal(size=(2, 1000))
     groups = np.split(e[np.argsort(x)], 20)
-    found = against_regressor(e, x, centred=True, a=np.ones(1))
+    found = against_regressor(e, x, a=np.ones(1))
     assert found.p == pytest.approx(scipy.stats.f_oneway(*groups).pvalue, rel=1e-8)
     np.testing.assert_allclose(found.means + e.mean(), [group.mean() for group in groups])
     within = sum(np.sum((group - group.mean()) ** 2) for group in groups)
@@ -162,11 +161,6 @@ def test_against_a_white_residual_bins_are_an_analysis_of_variance():
         found.errors, np.sqrt(within / 980 * (1 / 50 - 1 / 1000))
     )  # of the distance to the mean
     assert found.share == pytest.approx(1 - within / np.sum((e - e.mean()) ** 2))
-    mean_square = 50 * sum(group.mean() ** 2 for group in groups) / 20
-    against_zero = against_regressor(e, x, a=np.ones(1))
-    assert against_zero.p == pytest.approx(
-        scipy.stats.f.sf(mean_square / (within / 980), 20, 980), rel=1e-8
-    )
 
 
 def test_many_experiments_shorter_than_the_lags_are_tested_from_rest():
@@ -184,7 +178,6 @@ def test_many_experiments_shorter_than_the_lags_are_tested_from_rest():
 def test_an_offset_is_no_curve():
     rng = np.random.default_rng(9)
     e, x = rng.normal(0.5, 1.0, 2000), rng.normal(size=2000)
-    assert against_regressor(e, x).p < 1e-50
     found = report(e, x={"x": x})
     assert found.curved_regressors == () and found.mean == pytest.approx(0.5, abs=0.1)
 
@@ -249,8 +242,8 @@ def test_independence_keeps_its_level(colour, record_property):
         e, slow = (s[WARM_UP:] for s in (coloured(e, *COLOURS[colour]), coloured(slow, -0.95)))
         white, a = white[WARM_UP:], whitening_filter(e)
         first, second = (against_input(e, u, a=a) for u in (white, slow))
-        third, fourth = (against_regressor(e, x, centred=True, a=a) for x in (white, slow))
-        fifth = against_regressor(e, np.sign(slow), centred=True, a=a)
+        third, fourth = (against_regressor(e, x, a=a) for x in (white, slow))
+        fifth = against_regressor(e, np.sign(slow), a=a)
         rejected += [test.p < 0.01 for test in (first, second, third, fourth, fifth)] + [
             abs(second.values[28]) > second.band
         ]
@@ -458,32 +451,3 @@ def test_every_output_has_its_tests_as_plain_content():
         assert content["white"] is test.white and content["ljung_box"]["freedom"] == 25
         assert content["n"] == 500 and sum(content["regressors"]["w"]["counts"]) == 500
         assert content["correlated_inputs"] == list(test.correlated_inputs)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"inputs": []}, "`inputs` has 0 experiments but `residuals` has 1"),
-        ({"residuals": [], "inputs": [], "regressors": []}, "`residuals` has 0 experiments"),
-        (
-            {"inputs": [np.zeros((49, 1))]},
-            r"`inputs` of experiment 0 has the shape \(49, 1\); .* make \(50, 1\)",
-        ),
-        (
-            {"regressors": [np.zeros((50, 2))]},
-            r"`regressors` of experiment 0 has the shape \(50, 2\)",
-        ),
-        ({"residuals": [np.zeros(50)]}, r"`residuals` of experiment 0 has the shape \(50,\)"),
-        ({"output_names": ["y", "y"]}, "'y' is given twice"),
-        ({"lags": 0}, "`lags` must be a whole number, 1 or more"),
-        ({"fitted": -1}, "`fitted` must be a whole number, 0 or more"),
-        ({"level": 1.0}, "`level` must be between 0 and 1"),
-        ({"level": 0}, "`level` must be a positive number"),
-    ],
-)
-def test_what_does_not_match_is_refused(change, message):
-    column = [np.zeros((50, 1))]
-    arguments = dict(residuals=column, inputs=column, regressors=column)
-    arguments |= dict(output_names=["y"], input_names=["u"], regressor_names=["x"])
-    with pytest.raises(InputError, match=message):
-        analyse(**(arguments | change))

@@ -140,6 +140,12 @@ def check_number(value: Any, name: str, *, positive: bool = False) -> float:
     return float(value)
 
 
+def check_finite(value: Any, what: str) -> None:
+    """Raise InputError unless `value` is a finite number."""
+    if not is_number(value):
+        raise InputError(f"{what} must be a finite number; got {show(value)}.")
+
+
 def positive(scale: Vector) -> Vector:
     """Return the scale, 1 where it is not positive or not finite."""
     return np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)

@@ -55,10 +55,10 @@ def join_words(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "nothing"
 
 
-def first_words(words: Sequence[str], most: int) -> str:
+def first_words(words: Sequence[str], most: int, between: str = ", ") -> str:
     """Return so many words with commas, and how many more there are."""
     more = f" and {len(words) - most} more" if len(words) > most else ""
-    return ", ".join(words[:most]) + more
+    return between.join(words[:most]) + more
 
 
 def cut(text: str, most: int) -> str:

@@ -24,6 +24,7 @@ from orthaug._base.checks import Matrix, Vector, check_unique
 from orthaug._base.lines import percent
 from orthaug.analysis.suspects import MotionSuspect, Suspect
 from orthaug.inference.linearization import Certificate, Linearization
+from orthaug.physics.parameters import PhysicsMap
 from orthaug.physics.projection import Projection
 
 _KNOWN = 1e-6  # of a term's size: what the physics leaves of one that it has, with roots and powers
@@ -66,6 +67,16 @@ class TermResponse(NamedTuple):
 
 class TermPhysics(Protocol):
     """A fit as terms that it lacks meet it: all that differs between kinds of physics."""
+
+    @property
+    def fit(self) -> Any:
+        """The estimate; None before a fit."""
+        ...
+
+    @property
+    def map(self) -> PhysicsMap | None:
+        """The map from physical parameters to θ."""
+        ...
 
     @property
     def names(self) -> tuple[str, ...]:

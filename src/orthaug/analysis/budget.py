@@ -42,12 +42,12 @@ from orthaug.analysis.causes import (
 from orthaug.analysis.free_run_bias import linearize_fit
 from orthaug.analysis.measure_bias import linearization_of
 from orthaug.analysis.parameter_bias import (
-    EstimatedTerms,
     ParameterBias,
     owners_of,
     parameter_biases,
     physical_biases,
 )
+from orthaug.analysis.rival_forms import SelectedTerms
 from orthaug.analysis.suspects import (
     ODD_JUMPS,
     MotionSuspect,
@@ -102,7 +102,7 @@ class Budget:
         )
 
 
-class BudgetTerms(EstimatedTerms, Protocol):
+class BudgetTerms(SelectedTerms, Protocol):
     """A fit whose learner is to be explained: what a budget needs beside the table of biases."""
 
     @property

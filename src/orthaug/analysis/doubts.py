@@ -16,7 +16,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning, visible
-from orthaug._base.lines import percent
+from orthaug._base.lines import first_words, percent
 from orthaug._base.progress import Stage
 from orthaug.analysis.attempt import attempt
 from orthaug.analysis.findings import MemoryResult, SharedResult, StructureResult
@@ -167,9 +167,7 @@ def _withdrawal(fit: Any, result: Findings, left: float) -> str:
     lacks = "The learner holds only a part of what the physics lacks"
     if not fit.learns:
         lacks = "The physics still lacks something whose bias is not known"
-    return f" {lacks}, so no interval with its bias is given for {', '.join(names[:_NAMED])}" + (
-        f" and {len(names) - _NAMED} more." if len(names) > _NAMED else "."
-    )
+    return f" {lacks}, so no interval with its bias is given for {first_words(names, _NAMED)}."
 
 
 def _noise_only(

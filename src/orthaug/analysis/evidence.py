@@ -23,6 +23,7 @@ from orthaug.data.record import Record
 from orthaug.data.wild import data_warnings
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Estimate
+from orthaug.fitting.fit_plans import check_blocks
 from orthaug.fitting.independent_terms import independent_terms
 from orthaug.fitting.kinds import STRUCTURES
 from orthaug.fitting.noise import Noise, noise_of_motion
@@ -89,9 +90,7 @@ class Evidence:
             InputError: records or suspects that do not fit the model.
         """
         check_type(physics, PhysicsMap | None, "physics", "a PhysicsMap, or None")
-        blocks = None if blocks is None else check_count(blocks, "blocks", least=0)
-        if blocks == 1:
-            raise InputError("`blocks` must be 2 or more, or 0 for none; got 1.")
+        blocks = None if blocks is None else check_blocks(blocks)
         setup, problem = fit.setup, _problem_of(fit)
         learner = fit.model.form.bound.learner if fit.learns else None
         structure, own = STRUCTURES[fit.model.structure](), getattr(fit, "measure", None)

@@ -14,12 +14,10 @@ import numpy as np
 
 from orthaug._base.checks import Matrix
 from orthaug._base.errors import InputError, Warning
-from orthaug.analysis.input_timing import residual_of
+from orthaug.analysis.input_timing import refit_physics, residual_of
 from orthaug.data.record import Record
 from orthaug.data.regressors import lag_rows
 from orthaug.fitting.motion_task import MotionTask
-from orthaug.fitting.segmented_motion import SegmentedMotion
-from orthaug.models.learners import nothing_learned
 from orthaug.physics.problem import Problem
 
 if TYPE_CHECKING:
@@ -131,15 +129,10 @@ def misread_inputs(task: MotionTask, solver: Solver) -> tuple[Warning, ...]:
 
 def _run_with(task: MotionTask, read: Matrix, solver: Any) -> float:
     """Return what physics alone leaves of the free run with inputs read otherwise; inf if none."""
-    plan, problem = task.plan, task.problem
+    motion, record = task.problem.motion, _read_by(task.problem.record, read)
     assert task.physics is not None
+    begin = (motion.coordinates.initial, _ITERATIONS)
     try:
-        given = replace(plan.problem, record=_read_by(problem.record, read))
-        segmented = SegmentedMotion.of(given, nothing_learned(), plan.criterion)
+        return residual_of(*refit_physics(task, task.physics, motion, record, solver, *begin))
     except InputError:
         return float("inf")
-    segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps)
-    segmented = segmented.from_states(task.physics.end.point.states)
-    first = problem.motion.coordinates.initial
-    fitted = segmented.descend(segmented.objective(), first, solver.at_most(_ITERATIONS))
-    return residual_of(segmented, fitted if fitted.ending.usable else None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,17 +19,13 @@ from orthaug.analysis.parameter_bias import (
     parameter_biases,
     physical_biases,
 )
-from orthaug.analysis.rival_forms import RivalForm, SelectedTerms, rival_forms
+from orthaug.analysis.rival_forms import RivalForm, rival_forms
 
 _LISTED = 3  # forms and parameters that a warning lists at most
 _ROUNDING = 1e-6  # of a standard error
 
 
-class FormTerms(BudgetTerms, SelectedTerms, Protocol):
-    """A fit whose selected terms may have other forms."""
-
-
-def budget_by_forms(terms: FormTerms) -> Budget | None:
+def budget_by_forms(terms: BudgetTerms) -> Budget | None:
     """Return the bias of every parameter by the forms that fit as well as the selected ones.
 
     None where a learner is beside the physics, and where no form was selected or has a rival. A

@@ -401,11 +401,8 @@ class MotionTerms:
     @cached_property
     def _moves(self) -> tuple[Matrix, Matrix]:
         """Pairs of points that the learner does not distinguish."""
-        form, nx = self.place.segmented.dynamics, len(self.motion.states)
         points = np.concatenate([self.field.x, self.field.u], axis=1)
-        return moves(
-            lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points
-        )
+        return moves(self.place.segmented.dynamics.features_of, points)
 
 
 def spread(rows: np.ndarray) -> np.ndarray:

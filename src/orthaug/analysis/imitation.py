@@ -362,7 +362,7 @@ def _followed_by_memory(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -
     motion, nx = form.motion, x.shape[1]
     places = [i for i in learned_places(motion) if i >= nx or not motion.states[i].memory]
     slopes = np.asarray(slopes_at(form, q, x, u))[:, places]
-    z = np.asarray(form.seen(x.T, u.T, np)).T
+    z = form.features_at(x, u)
     own = [i for i, entry in enumerate(form.features) if str(entry) not in motion.memory]
     kept = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(z).all(axis=1)
     if kept.sum() < _FEWEST_ROWS:

@@ -94,36 +94,27 @@ def families(samples: int, seed: int) -> tuple[dict[str, Vector], dict[str, int]
     """Return named signals of amplitude 1, and the periods of the square waves among them."""
     from orthaug.analysis import signals  # scipy.signal is slow to import
 
-    def space_evenly(first: int, last: int) -> list[int]:
+    def space_evenly(last: int) -> list[int]:
         return sorted(
             {
-                *range(first, min(last, 8) + 1),
+                *range(1, min(last, 8) + 1),
                 *(round(8 * 1.4**i) for i in range(60) if 8 * 1.4**i <= last),
             }
         )
 
-    squares = {f"square, period {2 * half}": 2 * half for half in space_evenly(1, samples // 8)}
-    waves = {"white Gaussian": signals.white_gaussian(samples, amplitude=1, seed=seed)}
-    waves["white uniform"] = signals.white_uniform(samples, amplitude=1, seed=seed)
-    for h in space_evenly(1, max(samples // 64, 1))[::2]:
-        waves[f"white binary, hold {h}"] = signals.white_binary(
-            samples, amplitude=1, seed=seed, hold=h
-        )
-        waves[f"PRBS, hold {h}"] = signals.prbs(samples, amplitude=1, hold=h)
+    squares = {f"square, period {2 * half}": 2 * half for half in space_evenly(samples // 8)}
+    waves = {"white Gaussian": signals.white_gaussian(samples, seed)}
+    waves["white uniform"] = signals.white_uniform(samples, seed)
+    for h in space_evenly(max(samples // 64, 1))[::2]:
+        waves[f"white binary, hold {h}"] = signals.white_binary(samples, seed, h)
+        waves[f"PRBS, hold {h}"] = signals.prbs(samples, h)
     even = samples + samples % 2
     for part in [s for s in (1.0, 0.5, 0.2, 0.1, 0.03, 0.01) if s * samples > 16]:
         band, name = (1 / samples, part / 2), f"up to {part:g} Nyquist"
-        waves[f"multisine {name}"] = signals.multisine(samples, amplitude=1, band=band)
-        waves[f"odd multisine {name}"] = signals.multisine(even, amplitude=1, band=band, odd=True)[
-            :samples
-        ]
-        waves[f"swept square {name}"] = signals.swept_square(
-            samples, amplitude=1, band=band, logarithmic=True
-        )
-    waves |= {
-        name: signals.square(samples, amplitude=1, period=period)
-        for name, period in squares.items()
-    }
+        waves[f"multisine {name}"] = signals.multisine(samples, band)
+        waves[f"odd multisine {name}"] = signals.multisine(even, band, odd=True)[:samples]
+        waves[f"swept square {name}"] = signals.swept_square(samples, band)
+    waves |= {name: signals.square(samples, period) for name, period in squares.items()}
     return waves, squares
 
 

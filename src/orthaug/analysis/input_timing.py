@@ -193,11 +193,20 @@ def _try_hold(hold: str, task: MotionTask, solver: Any) -> HoldTrial:
 
 
 def refit_physics(
-    task: MotionTask, free_fit: FreeRunFit, motion: Motion, record: Record, solver: Any
+    task: MotionTask,
+    free_fit: FreeRunFit,
+    motion: Motion,
+    record: Record,
+    solver: Any,
+    start: Vector | None = None,
+    iterations: int = _REFITTED,
 ) -> tuple[SegmentedMotion, FreeRunFit | None]:
     """Return the physics trained on from the end of a fit, with another motion or record.
 
     None without a usable end.
+
+    Args:
+        start: where it begins, beside the states of that end; None for there, too.
 
     Raises:
         InputError: the motion does not take the record.
@@ -209,9 +218,8 @@ def refit_physics(
     segmented = segmented.physics_only.with_substeps(plan.dynamics.substeps).from_states(
         free_fit.end.point.states
     )
-    again = segmented.descend(
-        segmented.objective(), free_fit.end.point.theta, solver.at_most(_REFITTED)
-    )
+    p = free_fit.end.point.theta if start is None else start
+    again = segmented.descend(segmented.objective(), p, solver.at_most(iterations))
     return segmented, again if again.ending.usable else None
 
 

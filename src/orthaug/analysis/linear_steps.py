@@ -95,7 +95,7 @@ class LaggedStep:
             return None
         now = dict(zip((*self.rest, *self.inputs), (*rest, *inputs), strict=True))
         x = np.array([[now[lag.channel] for lag in self.form.layout]])
-        return np.asarray(self.form.features.evaluate(x, self.form.layout, np))[0]
+        return self.form.features_of(x)[0]
 
 
 @dataclass(frozen=True)

@@ -346,12 +346,20 @@ def bias_under(
 
 
 def linearization_of(
-    fit: LaggedEstimate, measure: Measure, physics: PhysicsMap | None = None
+    fit: LaggedEstimate,
+    measure: Measure,
+    physics: PhysicsMap | None = None,
+    problem: Problem | None = None,
 ) -> LaggedTerms:
-    """Return a fit for biases by terms, under the measure that θ was split under."""
-    weighed = weigh_problem(measure, fit.problem)
+    """Return a fit for biases by terms, under the measure that θ was split under.
+
+    Args:
+        problem: whose rows are weighed; None for that of the fit.
+    """
+    problem = fit.problem if problem is None else problem
+    weighed = weigh_problem(measure, problem)
     learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
-    return LaggedTerms(weighed, fit.problem, fit.theta, physics, learned, fit.model.shared, fit)
+    return LaggedTerms(weighed, problem, fit.theta, physics, learned, fit.model.shared, fit)
 
 
 def _by_inputs(terms: LaggedTerms, cause: SuspectedBias, biased: Sequence[str]) -> Iterator[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +14,6 @@ from orthaug.analysis.bias import TermPhysics
 from orthaug.analysis.bias_hull import Candidate, OtherForm, is_determined
 from orthaug.analysis.causes import Causes
 from orthaug.analysis.mapped_bias import physical_with_bias
-from orthaug.physics.parameters import PhysicsMap
 
 _ALIKE = 1e-6  # of a bias
 
@@ -40,20 +38,6 @@ class ParameterBias:
     """
 
 
-class EstimatedTerms(TermPhysics, Protocol):
-    """A fit as terms that it lacks meet it, with its map to physical parameters."""
-
-    @property
-    def fit(self) -> Any:
-        """The estimate."""
-        ...
-
-    @property
-    def map(self) -> PhysicsMap | None:
-        """The map from physical parameters to θ."""
-        ...
-
-
 def owners_of(
     found: Sequence[Causes | Candidate], moved: Float[np.ndarray, "k n"]
 ) -> list[tuple[str, float | None]]:
@@ -68,7 +52,7 @@ def owners_of(
 
 
 def physical_biases(
-    terms: EstimatedTerms,
+    terms: TermPhysics,
     found: Sequence[Causes | Candidate],
     candidates: Sequence[Candidate],
     other: Vector | float = 0.0,

@@ -23,7 +23,7 @@ from orthaug.analysis.free_run_equations import substep_bias
 from orthaug.analysis.free_run_stability import stability
 from orthaug.analysis.imitation import Imitation, MotionImitation, imitation
 from orthaug.analysis.learned_part import equation_parts
-from orthaug.analysis.measure_bias import LaggedTerms, bias_under
+from orthaug.analysis.measure_bias import LaggedTerms, bias_under, linearization_of
 from orthaug.analysis.missing_lags import missing_lags
 from orthaug.analysis.motion_modes import motion_stability
 from orthaug.analysis.other_solutions import find_other_solution
@@ -32,7 +32,7 @@ from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.lagged_estimate import LaggedEstimate
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
-from orthaug.inference.measures import WeighedPhysics, weigh_problem
+from orthaug.inference.measures import WeighedPhysics
 from orthaug.inference.nearly_shared import output_warnings, shared_warnings
 from orthaug.models.learners import learns
 from orthaug.models.response import Response
@@ -235,9 +235,7 @@ def _terms(fit: LaggedEstimate, evidence: Evidence) -> LaggedTerms:
     """
     own = fit.problem.weight.kind != evidence.problem.weight.kind or fit.problem.noise is not None
     problem = fit.problem if own else evidence.problem
-    weighed = weigh_problem(evidence.measure, problem)
-    learned = fit.model.learner_at(weighed.points.x) if fit.learns else None
-    return LaggedTerms(weighed, problem, fit.theta, evidence.map, learned, fit.model.shared, fit)
+    return linearization_of(fit, evidence.measure, evidence.map, problem)
 
 
 @analyse_physics.register(MotionEstimate)

@@ -19,8 +19,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Int
 
-from orthaug._base.checks import Matrix, Vector, check_count, check_number, check_unique
-from orthaug._base.errors import InputError
+from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment
 from orthaug.fitting.whiteness import (
     LARGEST,
@@ -121,7 +120,6 @@ def analyse(
     *,
     lags: int = 25,
     level: float = 0.01,
-    fitted: int = 0,
 ) -> tuple[ResidualTest, ...]:
     """Return all tests of the residual of every output, in their order.
 
@@ -135,11 +133,6 @@ def analyse(
         output_names: of the ny columns; equally `input_names` and `regressor_names`.
         lags: of all correlations; cut where the longest experiment is shorter.
         level: of every test; the bands hold one value with probability 1 − level.
-        fitted: dynamic parameters whose fit has used up degrees of freedom of Ljung-Box.
-
-    Raises:
-        InputError: experiments, rows or columns that do not match, a name twice, or a setting out
-            of range.
 
     Examples:
         >>> e, u = np.random.default_rng(0).normal(size=(2, 500, 1))
@@ -147,14 +140,9 @@ def analyse(
         >>> test.white, test.correlated_inputs, test.curved_regressors
         (True, (), ())
     """
-    lags, fitted = check_count(lags, "lags"), check_count(fitted, "fitted", least=0)
-    if not 0 < check_number(level, "level", positive=True) < 1:
-        raise InputError(f"`level` must be between 0 and 1; got {level!r}.")
-    lengths = [len(residual) for residual in residuals]
-    e = _channels(residuals, output_names, "residuals", lengths)
-    u = _channels(inputs, input_names, "inputs", lengths)
-    x = _channels(regressors, regressor_names, "regressors", lengths)
-    return tuple(_one_output(name, column, u, x, lags, level, fitted) for name, column in e.items())
+    e = _channels(residuals, output_names)
+    u, x = _channels(inputs, input_names), _channels(regressors, regressor_names)
+    return tuple(_one_output(name, column, u, x, lags, level) for name, column in e.items())
 
 
 def _one_output(
@@ -164,13 +152,12 @@ def _one_output(
     regressors: Channels,
     lags: int,
     level: float,
-    fitted: int,
 ) -> ResidualTest:
     whole = np.concatenate(e)
     n, finite = len(whole), len(whole) > 0 and bool(np.abs(whole).max() < LARGEST)
-    acf, box, a = autocorrelation(e, lags), ljung_box(e, lags, fitted), whitening_filter(e, lags)
+    acf, box, a = autocorrelation(e, lags), ljung_box(e, lags), whitening_filter(e, lags)
     cross = {key: against_input(e, u, lags, level=level, a=a) for key, u in inputs.items()}
-    curves = {key: against_regressor(e, x, centred=True, a=a) for key, x in regressors.items()}
+    curves = {key: against_regressor(e, x, a=a) for key, x in regressors.items()}
     return ResidualTest(
         name=name,
         n=n,
@@ -204,20 +191,8 @@ def _rejected_tests(tests: Mapping[str, Any], level: float) -> tuple[str, ...]:
     return tuple(name for name, value in p.items() if value < level / len(p))
 
 
-def _channels(
-    experiments: Sequence[Matrix], names: Sequence[str], what: str, lengths: Sequence[int]
-) -> Channels:
+def _channels(experiments: Sequence[Matrix], names: Sequence[str]) -> Channels:
     """Return every channel in one piece per experiment, by its name."""
-    check_unique(names, f"`{what}`:")
-    if len(experiments) != len(lengths) or not lengths:
-        raise InputError(
-            f"`{what}` has {len(experiments)} experiments but `residuals` has {len(lengths)}; "
-            "at least 1."
-        )
-    for i, (one, rows) in enumerate(zip(experiments, lengths, strict=True)):
-        if np.shape(one) != (rows, len(names)):
-            shape = f"{np.shape(one)}; its residuals and names make {(rows, len(names))}"
-            raise InputError(f"`{what}` of experiment {i} has the shape {shape}.")
     return {
         name: [np.asarray(one, dtype=float)[:, j] for one in experiments]
         for j, name in enumerate(names)
@@ -429,7 +404,7 @@ def against_input(
     band = float(
         -scipy.special.ndtri(level / 2) * np.sqrt(_spectral_product(a, u) / sum(map(len, e)))
     )
-    found = _relation(_lag_blocks(e, u, a, len(values) // 2), intercept=True)
+    found = _relation(_lag_blocks(e, u, a, len(values) // 2))
     causal = np.abs(values[len(values) // 2 :])
     return CrossTest(
         values, band, None if found is None else found.p, int(causal.argmax()), float(causal.max())
@@ -437,23 +412,17 @@ def against_input(
 
 
 def against_regressor(
-    residual: Pieces,
-    regressor: Pieces,
-    *,
-    centred: bool = False,
-    a: Vector | None = None,
+    residual: Pieces, regressor: Pieces, *, a: Vector | None = None
 ) -> RegressorTest | None:
-    """Test whether the mean residual is zero over the regressor, by an F-test over equal bins.
+    """Test whether the residual has its mean all over the regressor, by an F-test over equal bins.
 
-    A white residual is tested by the one-way analysis of variance against zero, `F = Σ n_b m_b² / B
-    : Σ (e − m_b)² / (N − B)`; for a coloured one the same hypothesis on A e with filtered
+    A white residual, less its mean, is tested by the one-way analysis of variance, `F = Σ n_b m_b²
+    / (B − 1) : Σ (e − m_b)² / (N − B)`; for a coloured one the same hypothesis on A e with filtered
     indicators of the bins. Equal values share a bin. None for a regressor or residual that is
     constant or not finite, or fewer than 10 rows.
 
     Args:
         residual, regressor: per experiment (N_i,).
-        centred: test against the mean of the residual instead of zero, with B − 1 degrees of
-            freedom.
         a: `whitening(residual)`, where it is known already.
     """
     e, x = pieces_of(residual), np.concatenate(pieces_of(regressor))
@@ -463,17 +432,15 @@ def against_regressor(
         return None
     size = np.abs(np.concatenate(e)).max()
     whole = np.concatenate(e) / size
-    whole = whole - centred * whole.mean()
+    whole = whole - whole.mean()
     counts = np.bincount(placed)
     means = np.bincount(placed, whole) / counts
     total, explained = float(whole @ whole), float(counts @ means**2)
     within = np.sqrt(max(total - explained, 0.0) / (len(whole) - len(counts)))
-    found = _relation(
-        _bin_blocks(split_like(whole, e), split_like(placed, e), a, len(counts)), intercept=centred
-    )
+    found = _relation(_bin_blocks(split_like(whole, e), split_like(placed, e), a, len(counts)))
     errors = within / np.sqrt(counts)
-    if found is not None and found.rank == len(counts) - centred:
-        contrast = np.eye(len(counts)) - centred * counts / len(whole)  # to the mean of all rows
+    if found is not None and found.rank == len(counts) - 1:
+        contrast = np.eye(len(counts)) - counts / len(whole)  # to the mean of all rows
         means = contrast @ found.coefficients
         errors = np.sqrt(np.maximum(np.diag(contrast @ found.covariance @ contrast.T), 0.0))
     centres, p = np.bincount(placed, x) / counts, None if found is None else found.p
@@ -555,8 +522,8 @@ class _Relation:
     covariance: Matrix
 
 
-def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
-    """Return β of `target = Z β + ε`, or `+ constant`, from blocks of rows (1, Z, target).
+def _relation(blocks: Iterable[Matrix]) -> _Relation | None:
+    """Return β of `target = Z β + constant + ε` from blocks of rows (1, Z, target).
 
     P by F(rank, rest).
 
@@ -567,12 +534,12 @@ def _relation(blocks: Iterable[Matrix], intercept: bool) -> _Relation | None:
     if not gram.ndim:
         return None
     rows = gram[0, 0]
-    gram = gram - intercept * np.outer(gram[0], gram[0]) / rows
+    gram = gram - np.outer(gram[0], gram[0]) / rows
     inner, moment, total = gram[1:-1, 1:-1], gram[1:-1, -1], gram[-1, -1]
     unit = 1 / np.sqrt(np.where(np.diag(inner) > 0, np.diag(inner), np.inf))
     values, vectors = np.linalg.eigh(inner * np.outer(unit, unit))
     kept = values > _RANK * max(values[-1], 1.0)
-    rank, freedom = int(kept.sum()), rows - kept.sum() - intercept
+    rank, freedom = int(kept.sum()), rows - kept.sum() - 1
     if rank == 0 or freedom < 1 or total <= 0:
         return None
     # Of the inverse of the inner products

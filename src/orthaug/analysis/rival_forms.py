@@ -27,9 +27,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug.analysis.bias import TermPhysics
 from orthaug.analysis.bias_hull import AS_LIKELY, LEAST
 from orthaug.analysis.free_run_equations import solve_scaled
-from orthaug.analysis.parameter_bias import EstimatedTerms
 
 _MOST_FORMS = 24  # tried in equations of first order: those that are most alike
 _BRACKETED = re.compile(r"(?<!\w)\((\w+(?:\[[^\]]*\])?)\)")  # one name in brackets of its own
@@ -117,7 +117,7 @@ class FormEquations(Protocol):
         ...
 
 
-class SelectedTerms(EstimatedTerms, Protocol):
+class SelectedTerms(TermPhysics, Protocol):
     """A fit with terms whose forms were selected: all that differs between kinds of physics."""
 
     def forms(self, selected: int) -> Forms[Any] | None:

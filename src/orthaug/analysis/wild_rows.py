@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent, plural
+from orthaug._base.lines import first_words, percent, plural
 from orthaug.analysis.residuals import errors_of
 from orthaug.analysis.trained_start import from_trained_start
 from orthaug.data.gaps import Mending
@@ -75,13 +75,12 @@ def wild_rows(response: Response, record: Record, *, free_run: bool = False) -> 
         ):
             continue
         at = [rows[k] for k in wild]
-        named = [record.experiments[i].where(row) for i, row in at[:_NAMED]]
-        more = f" and {len(wild) - _NAMED} more" if len(wild) > _NAMED else ""
+        named = first_words([record.experiments[i].where(row) for i, row in at], _NAMED, "; ")
         what = "error of the free run" if free_run else "one-step residual"
         remedy, step = _marking(record, j, at)
         text = (
             f"{plural(len(wild), 'row')} of {len(error)} make up {percent(held, 3)} of the "
-            f"squared {what} of {output.name}: {'; '.join(named)}{more}. Wrong "
+            f"squared {what} of {output.name}: {named}. Wrong "
             f"samples among them bias θ: {remedy}"
         )
         found.append(Mending(Warning("wild_rows", text), output.name, step))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
-from orthaug._base.lines import join_words, plural
+from orthaug._base.lines import first_words, join_words, plural
 from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
@@ -113,7 +113,6 @@ class ProposalErrors:
 
     proposal: Proposal
     pieces: Pieces | None
-    physics_only: bool = False
     base: Pieces | None = None
     """The present model's errors on the same samples, where the proposal leaves some out."""
     initials: dict[str, Any] = field(default_factory=dict)
@@ -178,7 +177,7 @@ class Trials:
             LOG.info("a change was not tried: %s", error)
             return None
 
-    def of(self, proposal: Proposal, *, physics_only: bool) -> ProposalErrors:
+    def of(self, proposal: Proposal) -> ProposalErrors:
         """Return the trial of a proposal."""
         try:
             job = self.changed_job(proposal.change)
@@ -186,16 +185,16 @@ class Trials:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return ProposalErrors(proposal, None)
         criterion = job.spec.declared_criterion() if proposal.refocuses else self.variant.criterion
-        kind = PHYSICS_ONLY if physics_only else None if proposal.learns else self.variant.kind
+        kind = None if proposal.learns else self.variant.kind
         made = self.run(job, Variant(kind, criterion=criterion), proposal.accepts, proposal.step)
         if made is None:
-            return ProposalErrors(proposal, None, physics_only)
+            return ProposalErrors(proposal, None)
         initials = self.job.physics.with_initials(self.job, made[1])
         base = None
         if proposal.mends:
             mended = self.run(job, self.variant, step=proposal.step, mends=True)
             base = mended and mended[0]
-        return ProposalErrors(proposal, made[0], physics_only, base, initials)
+        return ProposalErrors(proposal, made[0], base, initials)
 
     def restarted(self, base: Pieces, tried: list[ProposalErrors]) -> list[ProposalErrors]:
         """Return the trials, less those that only led the unchanged spec to a better solution.
@@ -212,7 +211,7 @@ class Trials:
             [f"{key.split('.')[-2]} = {value:.4g}" for key, value in best.initials.items()]
         )
         words = f"the initial values {listed}"
-        again = self.of(Proposal(words, best.initials, restarts=True), physics_only=False)
+        again = self.of(Proposal(words, best.initials, restarts=True))
         own = again.pieces
         if own is None or not again.error < (min(before, _NO_BETTER) + best.error) / 2:
             return tried
@@ -277,7 +276,7 @@ def _tried(
     trials = Trials(job, rows, variant, fit.problem.deviation, settled)
 
     def errors_of(proposal: Proposal, _: object) -> ProposalErrors:
-        return trials.of(proposal, physics_only=False)
+        return trials.of(proposal)
 
     # Where samples are to be mended, what seems missing may come from these: it is tried after them
     replacing = [proposal for proposal in found if proposal.replaces]
@@ -369,11 +368,8 @@ def _conclude_trials(
         else "."
     )
     if worse:
-        named = "; ".join(
-            f"{one.proposal.words} ({_error_text(one, base)})" for one in worse[:_LISTED]
-        )
-        more = f" and {len(worse) - _LISTED} more" if len(worse) > _LISTED else ""
-        text += f" No sure gain over {_error(before)}: {named}{more}."
+        words = [f"{one.proposal.words} ({_error_text(one, base)})" for one in worse]
+        text += f" No sure gain over {_error(before)}: {first_words(words, _LISTED, '; ')}."
         if any(_hurts(one, base) for one in worse[:_LISTED]):
             text += f" {_NOT_TO_BE_MADE}"
     if left:
@@ -451,11 +447,10 @@ def _may_be_chance(one: ProposalErrors, before: float) -> bool:
 
 
 def _advice_text(one: ProposalErrors, before: float, rows: ValidationRows, *, looped: bool) -> str:
-    alone = " of physics alone" if one.physics_only else ""
     begin = "Training ended beside a better solution. With" if one.proposal.restarts else "With"
     if looped and one.proposal.step is None and not one.proposal.restarts:
         begin = f"{_IF_LEFT}, with"
-    text = f"{begin} {one.proposal.words} the free run{alone} on {rows.where}"
+    text = f"{begin} {one.proposal.words} the free run on {rows.where}"
     if math.isinf(before):
         return (
             f"{text} no longer diverges: its error is {_error(one.error)} of the output's "

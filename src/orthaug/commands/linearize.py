@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from orthaug._base.errors import InputError
 from orthaug._base.folders import check_replaceable, whole_file, whole_folder
-from orthaug.commands.folder import check_figure, check_file, save_figure
+from orthaug.commands.folder import check_figure, check_file, check_kept, save_figure
 from orthaug.commands.parts import load_parts
 from orthaug.commands.run import ReadOptions, missing_notes, open_run, prepared_notes
 from orthaug.commands.spec import load_spec
@@ -39,9 +39,7 @@ def check_place(out: Path | None, *read: Path, force: bool = False) -> None:
         )
     else:
         check_replaceable(out, force=force)
-        for file in read:
-            if file.exists() and file.resolve().is_relative_to(out.resolve()):
-                raise InputError(f"{out}: holds {file}, which is read; give another folder.")
+        check_kept(out, *read)
 
 
 def open_linear(model: Path, data: Path | None) -> tuple[Model, Record | None, tuple[str, ...]]:

@@ -12,7 +12,7 @@ from typing import Annotated, Protocol, runtime_checkable
 import numpy as np
 from annotated_types import Ge, Gt
 
-from orthaug._base.checks import Matrix, Vector, check_number, check_type, is_number, nearest
+from orthaug._base.checks import Matrix, Vector, check_finite, check_number, check_type, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.registry import OneOf, check_fields
 
@@ -318,8 +318,8 @@ class Limits:
         check_fields(self)
         for name in ("low", "high"):
             value = getattr(self, name)
-            if value is not None and not is_number(value):
-                raise InputError(f"`{name}` must be a finite number; got {show(value)}.")
+            if value is not None:
+                check_finite(value, f"`{name}`")
         if self.low is None and self.high is None:
             raise InputError("`limits` has neither `low` nor `high`; give one of them.")
 
@@ -422,8 +422,7 @@ class Shift:
 
     def __post_init__(self) -> None:
         check_type(self.channel, str, "channel", "an input's name")
-        if not is_number(self.samples):
-            raise InputError(f"`samples` must be a finite number; got {show(self.samples)}.")
+        check_finite(self.samples, "`samples`")
         if self.samples == int(self.samples):
             object.__setattr__(self, "samples", int(self.samples))
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, nearest
 from orthaug._base.errors import InputError, MissingColumnError
+from orthaug._base.lines import first_words
 from orthaug._base.memory import check_memory, in_words
 from orthaug.data.matlab import MOST_ELEMENTS, Variable, read_mat5
 
@@ -360,11 +361,8 @@ def _take_channels(
 def _pick(path: Path, name: str, held: Mapping[str, FileVariable]) -> Vector:
     name = _known_as(name, held)
     variable, axis, index = (name, 0, 0) if name in held else _line(path, name)
-    listing = (
-        ", ".join(f"{key} ({value.what})" for key, value in list(held.items())[:_NAMED])
-        or "nothing"
-    )
-    listing += f" and {len(held) - _NAMED} more" if len(held) > _NAMED else ""
+    described = [f"{key} ({value.what})" for key, value in held.items()]
+    listing = first_words(described, _NAMED) or "nothing"
     if variable not in held:
         ours = _ELEMENT.sub(lambda m: f"[{int(m[1]) - 1}{',:' if m[2] else ''}]", name)
         hint = f'; elements are counted from 0 here, "{ours}"' if ours != name else ""

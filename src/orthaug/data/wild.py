@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.lines import percent, plural
+from orthaug._base.lines import first_words, percent, plural
 from orthaug.data.angles import reset_warnings, wrapped_angles
 from orthaug.data.gaps import (
     Mending,
@@ -261,10 +261,8 @@ def _same_signal_warnings(record: Record) -> list[Warning]:
 def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
     name = own[0].name
     where = [
-        f"{record.experiments[s.experiment].where(s.row)}: {name} = {s.value:.6g}"
-        for s in own[:_NAMED]
+        f"{record.experiments[s.experiment].where(s.row)}: {name} = {s.value:.6g}" for s in own
     ]
-    more = f" and {len(own) - _NAMED} more" if len(own) > _NAMED else ""
     column = next(c.file_column for c in (*record.inputs, *record.outputs) if c.name == name)
     of = f" (column '{column}')" if column != name else ""
     answer = "no output responds" if own[0].column < len(record.inputs) else "no input causes it"
@@ -277,8 +275,8 @@ def _wild_text(record: Record, own: tuple[WildSample, ...], effect: str) -> str:
         else "apart from"
     )
     return (
-        f"{'; '.join(where)}{more}{of}, {far} every other sample, and {answer}. It is a wild "
-        f"sample with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} "
+        f"{first_words(where, _NAMED, '; ')}{of}, {far} every other sample, and {answer}. It is a "
+        f"wild sample with {percent(_share_of(record, own), 3)} of the squares of {name}.{effect} "
         f'Mark it by [[data.prepare]], step = "outliers", channels = ["{name}"], threshold = '
         f'{threshold_for(record, own):g}. Add missing = "skip" in [data], or a step "fill" '
         "behind it."
@@ -342,12 +340,10 @@ def _single_repeats(record: Record) -> list[Warning]:
         chance += int(held.sum()) * float(np.prod(np.minimum(steps / spread, 1.0)))
     if len(places) < _REPEATS or chance > _BY_CHANCE * len(places) or len(places) < every / 2:
         return []
-    shown = "; ".join(places[:_NAMED])
-    more = f" and {len(places) - _NAMED} more" if len(places) > _NAMED else ""
     text = (
-        f"{shown}{more}: the row repeats the one before in all channels. A logger wrote it "
-        "twice, or it did not get a new sample: all later rows then come a step too late, which "
-        "moves the parameters. Take these rows out of the file."
+        f"{first_words(places, _NAMED, '; ')}: the row repeats the one before in all channels. A "
+        "logger wrote it twice, or it did not get a new sample: all later rows then come a step "
+        "too late, which moves the parameters. Take these rows out of the file."
     )
     return [Warning("repeated_rows", text)]
 

@@ -38,7 +38,6 @@ from orthaug.inference.splitting import MotionSplit
 from orthaug.models.beyond import limits_of, pull_of
 from orthaug.models.dynamics import Dynamics, Numbers
 from orthaug.models.lagged import LaggedDynamics
-from orthaug.models.learners import Scaling
 from orthaug.models.model import Model, TrainedSegments
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.starts import EstimatedStates
@@ -140,18 +139,18 @@ def _model(
     form = LaggedDynamics(
         problem.baseline, problem.features, problem.layout, problem.outputs, learned.bound
     )
-    limits, pull = _limits(problem, form)
     gram = None if learned.gram is None else _fix_entries(held, learned.gram)
+    model = _model_of(
+        problem,
+        structure,
+        replace(learned, gram=gram),
+        errors._replace(noise=noise),
+        form,
+        Numbers(*numbers, learned.tilt),
+        middle=None if middle is None else _fix_entries(held, middle),
+    )
     return replace(
-        _model_of(
-            problem,
-            structure,
-            replace(learned, gram=gram),
-            errors._replace(noise=noise),
-            form,
-            Numbers(*numbers, learned.tilt, limits=limits, pull=pull),
-            middle=None if middle is None else _fix_entries(held, middle),
-        ),
+        _with_limits(model, problem.feature_range, problem.rows.x),
         shared=directions(structure, problem, parameters.fixed),
         noise=None if problem.noise is None else problem.noise.noise,
     )
@@ -203,17 +202,20 @@ def _model_of(
     )
 
 
-def _limits(problem: Problem, form: LaggedDynamics) -> tuple[Matrix | None, Matrix | None]:
-    """Return the range of the features, and how x follows its limits.
+def _with_limits(model: Model[Any], seen: Matrix, points: Matrix) -> Model[Any]:
+    """Return the model with the range of its features, and how points follow its limits.
 
-    Beyond the range the correction stays constant or fades.
+    Beyond that range the correction stays constant or fades.
+
+    Args:
+        seen: features (N, nz) of training.
+        points: of training, of `Model.reach`.
     """
-    limits = None if form.beyond == "free" else limits_of(problem.feature_range)
+    limits = None if model.form.beyond == "free" else limits_of(seen)
     if limits is None:
-        return None, None
-    return limits, pull_of(
-        lambda x: np.asarray(form.features.evaluate(x, form.layout, np)), problem.rows.x
-    )
+        return model
+    pull = pull_of(model.form.features_of, points)
+    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
 
 
 def _one_step_errors(
@@ -444,7 +446,7 @@ def _learner_values(plan: SegmentedMotion, learned: TrainedLearner) -> Matrix | 
     assert learned.coefficients is not None
     x, u = plan.trajectory(learned.coefficients, learned.weights, learned.scores.states)
     with np.errstate(all="ignore"):
-        features = plan.scaling(np.asarray(plan.dynamics.seen(x.T, u.T, np)).T)
+        features = plan.scaling(plan.dynamics.features_at(x, u))
     values = np.asarray(jax.vmap(lambda z: bound.values(jnp.asarray(learned.weights), z))(features))
     return values if np.isfinite(values).all() else None
 
@@ -467,40 +469,24 @@ def _motion_model(
     if not learned.ending.usable:
         return model
     if model.learns:
-        model = replace(model, seen=_feature_range(model, plan.record))
-        model = _with_limits(model, plan.record)
+        model = _with_feature_range(model, model.reach(plan.record))
     if plan.predictor is None and not briefly:  # a predictor forgets where it began
         model = replace(model, starts=_best_starts(model, plan.record))
     return model
 
 
-def _with_limits(model: Model[MotionDynamics], record: Record) -> Model[MotionDynamics]:
-    """Return the model with the range of its features over the fitted run.
+def _with_feature_range(model: Model[MotionDynamics], points: Matrix) -> Model[MotionDynamics]:
+    """Return the model with the range of its features over the fitted run, and its limits.
 
-    Beyond that range the correction stays constant or fades.
+    Unchanged where the features have no finite values.
     """
-    limits = None if model.form.beyond == "free" or model.seen is None else limits_of(model.seen)
-    if limits is None:
-        return model
-    nx = model.form.states
-
-    def features(points: Matrix) -> Matrix:
-        return model.form.features_at(points[:, :nx], points[:, nx:])
-
-    pull = pull_of(features, model.reach(record))
-    return replace(model, numbers=model.numbers._replace(limits=limits, pull=pull))
-
-
-def _feature_range(model: Model[MotionDynamics], record: Record) -> Matrix | None:
-    """Return the least and largest (2, nz) of the learner's features over the free run.
-
-    None where it has no finite ones.
-    """
-    states, inputs = np.split(model.reach(record), [model.form.states], axis=1)
     with np.errstate(all="ignore"):
-        features = model.form.features_at(states, inputs)
+        features = model.form.features_of(points)
     finite = features[np.isfinite(features).all(axis=1)]
-    return np.stack([finite.min(axis=0), finite.max(axis=0)]) if finite.size else None
+    if not finite.size:
+        return model
+    seen = np.stack([finite.min(axis=0), finite.max(axis=0)])
+    return _with_limits(replace(model, seen=seen), seen, points)
 
 
 def _best_starts(model: Model[MotionDynamics], record: Record) -> EstimatedStates:
@@ -560,7 +546,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
     segmented = segmented.with_substeps(form.substeps)
     segmented = replace(
         segmented,
-        scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
+        scaling=model.reached,
         unit=np.asarray(numbers.gain),
     )
     states, slope = (_pad_segments(part, segmented) for part in (kept.states, kept.slope))

@@ -51,7 +51,7 @@ from orthaug.fitting.structures import Orthogonal, Structure
 from orthaug.fitting.training import Choice
 from orthaug.inference.covariance import whitening_matrix
 from orthaug.inference.measures import Training
-from orthaug.models.learners import MLP, Learner, Scaling, declared, learns
+from orthaug.models.learners import MLP, Learner, declared, learns
 from orthaug.models.model import Model
 from orthaug.models.rows import Engine, InMemory
 from orthaug.models.tasks import Tasks
@@ -529,9 +529,8 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError(
             f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
         )
-    scaling = Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth))
     problem = problem.for_linear_learner() if model.form.features.linear else problem
-    task = OneStepTask.of(problem, bound.learner, scaling, np.asarray(numbers.gain), engine)
+    task = OneStepTask.of(problem, bound.learner, model.reached, np.asarray(numbers.gain), engine)
     return task, model.theta - model.theta_aux
 
 

@@ -10,7 +10,7 @@ records by which these rules were chosen.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -108,7 +108,7 @@ def _why_not(
     """Return the reason why one step ahead is not enough; None where it is."""
     if not first.model.form.states:
         return None  # nothing is fed back: a free run is the prediction
-    wrong = _beside_physics(first, [problem.record], problem)
+    wrong = _beside_physics(first, problem.record, problem)
     if wrong is not None:
         return f"{wrong} over the training data"
     if first.learns:
@@ -121,7 +121,7 @@ def _why_not(
         made, held = (
             (first, validation) if validation is not None else _on_half(problem, fit, options)
         )
-        wrong = None if made is None else _beside_physics(made, [held], problem)
+        wrong = None if made is None else _beside_physics(made, held, problem)
         if wrong is not None:
             return f"{wrong} {where}"
     if _is_coloured(first):
@@ -129,16 +129,13 @@ def _why_not(
     return _INCONSISTENT if _is_inconsistent(first) else None
 
 
-def _beside_physics(fit: Estimate, records: Sequence[Record], problem: PosedProblem) -> str | None:
+def _beside_physics(fit: Estimate, record: Record, problem: PosedProblem) -> str | None:
     """Return the fault of a fit's free runs compared to those of its physics alone.
 
     None for nothing.
     """
     physics = fit if fit.physics_alone is None else fit.physics_alone
-    own, alone = (
-        mean_square([p for r in records for p in _errors(one, r, problem)])
-        for one in (fit, physics)
-    )
+    own, alone = (mean_square(_errors(one, record, problem)) for one in (fit, physics))
     if math.isinf(own):
         return "its free run diverges"
     return "its free run is worse than that of physics alone" if own > _SLACK**2 * alone else None

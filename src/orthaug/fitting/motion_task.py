@@ -35,7 +35,7 @@ from orthaug.fitting.simulation_task import NOTICEABLE, SimulationTask, StartPoi
 from orthaug.fitting.solvers.levenberg_marquardt import LevenbergMarquardt
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Structure
-from orthaug.models.learners import Bound, Learner, Scaling, declared, learns
+from orthaug.models.learners import Bound, Learner, declared, learns
 from orthaug.models.model import Model
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.rows import Engine
@@ -524,14 +524,14 @@ class MotionTask(SimulationTask):
         if not plan.bound.learns:
             return plan
         point = physics.end.point
-        x, u = (part.T for part in plan.physics_only.trajectory(point.c, (), point.states))
+        x, u = plan.physics_only.trajectory(point.c, (), point.states)
         with np.errstate(all="ignore"):
-            features = np.asarray(plan.dynamics.seen(x, u, np)).T
+            features = plan.dynamics.features_at(x, u)
         finite = features[np.isfinite(features).all(axis=1)]
         scaling = scaling_of(
             plan.bound.learner, finite if len(finite) else np.zeros((1, features.shape[1]))
         )
-        return replace(plan, scaling=scaling, unit=sizes_learned(plan, point.c, x.T, u.T))
+        return replace(plan, scaling=scaling, unit=sizes_learned(plan, point.c, x, u))
 
     def places(
         self,
@@ -608,11 +608,7 @@ class WarmMotionTask(MotionTask):
         """
         form, numbers = model.form, model.numbers
         plan = SegmentedMotion.of(problem, form.bound, criterion, sums=SegmentSums.of(engine))
-        plan = replace(
-            plan,
-            scaling=Scaling(np.asarray(numbers.centre), np.asarray(numbers.halfwidth)),
-            unit=np.asarray(numbers.gain),
-        )
+        plan = replace(plan, scaling=model.reached, unit=np.asarray(numbers.gain))
         coordinates = problem.motion.coordinates
         beside = form.coordinates.physical(model.theta - model.theta_aux)
         return cls(plan, begun=np.clip(coordinates.of(beside), *coordinates.bounds))

@@ -37,7 +37,7 @@ from orthaug.models.rows import (
 from orthaug.models.statistics import column_units, half_inverse
 from orthaug.physics.noise import NoiseModel, RowFilter
 from orthaug.physics.problem import Problem
-from orthaug.physics.projection import Factor
+from orthaug.physics.projection import Projection
 
 CONVENTIONS = ("calibrated", "paper")
 
@@ -76,20 +76,20 @@ def mixing_matrix(noise: Matrix) -> Matrix:
     return (vectors * np.sqrt(np.maximum(values, 0.0))).T
 
 
-def theta_covariance(factor: Factor, middle: Matrix, fixed: Collection[int] = ()) -> Matrix:
+def theta_covariance(projection: Projection, middle: Matrix, fixed: Collection[int] = ()) -> Matrix:
     """Return Cov θ̂ (nθ, nθ) of θ̂ = Φ⁺Y.
 
     For one output this is the textbook s²(ΦᵀΦ)⁻¹.
 
     Args:
-        factor: of Φ.
+        projection: of Φ.
         middle: ΣqᵀΣ_eq (nθ, nθ) over the rows q of Q, in whitened outputs; for one output s² I.
         fixed: entries at a bound. They have NaN; the others' covariance holds with them fixed
             there.
     """
-    nt = len(factor.scale)
+    nt = len(projection.scale)
     free = [i for i in range(nt) if i not in fixed]
-    root = factor.covariance_factor(free)
+    root = projection.covariance_factor(free)
     covariance = np.full((nt, nt), np.nan)
     covariance[np.ix_(free, free)] = root @ middle @ root.T
     return covariance

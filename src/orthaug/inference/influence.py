@@ -18,6 +18,7 @@ import scipy.special
 from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import span
 from orthaug._base.jax import jnp
 from orthaug.inference.covariance import changes
 from orthaug.models.model import Model
@@ -109,9 +110,7 @@ def _white_test(influence: Matrix, errors: Vector) -> float:
     if not products.size or products.shape[1] > len(errors) // _ROWS_PER_PRODUCT:
         return 1.0
     products = products - products.mean(axis=0)
-    scale = np.linalg.norm(products, axis=0)
-    u, sigma, _ = np.linalg.svd(products / np.where(scale > 0, scale, 1.0), full_matrices=False)
-    basis = u[:, sigma > max(_RANK * sigma.max(initial=0.0), 1e-12)]
+    basis = span(products, _RANK)
     squares = errors**2 - np.mean(errors**2)
     total = float(squares @ squares)
     if not total > 0 or not basis.shape[1]:

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
+from orthaug._base.lines import first_words
 from orthaug.inference.covariance import interval
 from orthaug.physics.projection import Projection
 
@@ -72,14 +73,12 @@ def differing_warning(
     if not found.larger:
         return None
     worst = sorted(found.larger, key=lambda i: -found.ratio[i])
-    shown, more, i = worst[:_LISTED], len(worst) - _LISTED, worst[0]
-    listed = ", ".join(
-        f"{names[j]} by {found.ratio[j]:.2g} times its standard error" for j in shown
-    )
+    listed = [f"{names[j]} by {found.ratio[j]:.2g} times its standard error" for j in worst]
+    i = worst[0]
     low, high = found.interval[i]
     text = (
         f"parameters differ between the {found.experiments} experiments by more than `ci95` "
-        f"allows: {listed}{f' and {more} more' if more > 0 else ''}. `ci95` holds for the inputs "
+        f"allows: {first_words(listed, _LISTED)}. `ci95` holds for the inputs "
         "that were applied; other inputs move the bias by what the physics lacks. For experiments "
         f"like these {names[i]} is {values[i]:.6g}, and between {low:.6g} and {high:.6g}."
     )

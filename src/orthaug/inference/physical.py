@@ -182,12 +182,6 @@ def _whitener(target: Vector, covariance: Matrix) -> Matrix | None:
 
     None where an entry of θ has no variance, as at a bound.
     """
-    nt = len(target)
-    if covariance.shape != (nt, nt):
-        raise InputError(
-            f"`covariance` has shape {covariance.shape}; expected ({nt}, {nt}), a row for each "
-            "theta."
-        )
     if not np.isfinite(covariance).all():
         return None
     # θ̂ is rounded itself: a variance of zero becomes that of its last digit
@@ -223,10 +217,8 @@ def solve(
         starts: points about p⁰ from which the solution is sought besides p⁰ itself.
 
     Raises:
-        InputError: arguments of another shape, or that are no estimate, covariance or degrees of
-            freedom.
+        InputError: θ̂ of another shape, or what is no estimate or covariance.
     """
-    _check_freedom(freedom)
     fit = _Fit.of(physics, theta_hat, covariance)
     value, *others = fit.solutions(starts)
     residual, jacobian = fit.at(value)
@@ -304,18 +296,6 @@ def _linear(
     return spread, sensitivities
 
 
-def _check_freedom(freedom: float) -> None:
-    if (
-        isinstance(freedom, bool)
-        or not isinstance(freedom, int | float | np.number)
-        or not freedom > 0
-    ):
-        raise InputError(
-            "`freedom` must be a positive number, the residual's degrees of freedom; got "
-            f"{freedom!r}."
-        )
-
-
 def _consistency(chi2: float, df: int, freedom: float, held: bool) -> Consistency:
     """Return the test of θ̂ against h(p̂), with χ²/df compared to F(df, freedom).
 
@@ -384,10 +364,9 @@ def profile(
     name: str,
     *,
     freedom: float,
-    level: float = 0.95,
     starts: int = 4,
 ) -> tuple[float, float]:
-    """Return the profile-likelihood interval of one physical parameter.
+    """Return the 95 % profile-likelihood interval of one physical parameter.
 
     The interval is {pᵢ : min over the others χ² ≤ least χ² + F(1, freedom)}.
 
@@ -395,14 +374,11 @@ def profile(
     side without a limit from the data is ±inf.
 
     Raises:
-        InputError: as for `solve`, an unknown name, a level outside (0, 1), or no covariance.
+        InputError: as for `solve`, an unknown name, or no covariance.
     """
-    _check_freedom(freedom)
     if name not in physics.names:
         hint = nearest(name, physics.names) or f"; known are {', '.join(physics.names)}."
         raise InputError(f"'{name}' is no physical parameter{hint}")
-    if not 0 < level < 1:
-        raise InputError(f"`level` must be between 0 and 1, such as 0.95; got {level!r}.")
     fit = _Fit.of(physics, theta_hat, covariance)
     if not fit.known:
         raise InputError(
@@ -411,7 +387,7 @@ def profile(
     best, i = fit.solutions(starts)[0], physics.names.index(name)
     residual, jacobian = fit.at(best)
     others = replace(fit, free=tuple(j for j in fit.free if j != i))
-    least, limit = float(residual @ residual), scipy.special.stdtrit(freedom, 0.5 + level / 2) ** 2
+    least, limit = float(residual @ residual), scipy.special.stdtrit(freedom, 0.975) ** 2
     path = [best]  # the others' last minimum is the next start
 
     @cache  # a bracket's end keeps its sign, however far the path has come since

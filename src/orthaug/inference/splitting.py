@@ -272,7 +272,7 @@ def shared_of_motion(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> S
     nx = x.shape[1]
     points = np.concatenate([x, u], axis=1)
     points = points[np.isfinite(points).all(axis=1)]
-    pairs = moves(lambda rows: np.asarray(form.seen(rows[:, :nx].T, rows[:, nx:].T, np)).T, points)
+    pairs = moves(form.features_of, points)
     some = points[:: max(1, len(points) // _POINTS)]
     for start, end in (
         pairs,
@@ -303,15 +303,14 @@ def _left_over(
     """Return the part of the slopes at the points that no function of the features follows."""
     some = points[:: max(1, -(-len(points) // _ROWS))]
     slopes = np.asarray(slopes_at(form, q, some[:, :nx], some[:, nx:]))
-    features = np.asarray(form.seen(some[:, :nx].T, some[:, nx:].T, np)).T
-    return left_over(slopes, features, _has_learner(form.motion))
+    return left_over(slopes, form.features_of(some), _has_learner(form.motion))
 
 
 def _spanned_directions(form: MotionDynamics, q: Vector, x: Matrix, u: Matrix) -> SharedDirections:
     """Return the directions that the learner's features span and that move no other equation."""
     some = slice(None, None, max(1, len(x) // _POINTS))
     slopes = np.moveaxis(np.asarray(slopes_at(form, q, x[some], u[some])), 1, 0)
-    features = np.asarray(form.seen(x[some].T, u[some].T, np)).T
+    features = form.features_at(x[some], u[some])
     return spanned_directions(form.motion.names, slopes, features, _has_learner(form.motion))
 
 

@@ -142,8 +142,11 @@ class LaggedDynamics:
         return inputs
 
     def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
-        x = self.regressor(states.T, inputs.T, np).T
-        return np.asarray(self.features.evaluate(x, self.layout, np))
+        return self.features_of(self.regressor(states.T, inputs.T, np).T)
+
+    def features_of(self, points: Matrix) -> Float[np.ndarray, "N nz"]:
+        """Return the learner's features at regressors (N, nx)."""
+        return np.asarray(self.features.evaluate(points, self.layout, np))
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -210,7 +213,7 @@ class LaggedDynamics:
     def learner_at(self, numbers: Numbers, x: Matrix) -> Matrix:
         """Return f (T, ny) at regressors (T, nx), in the outputs' units, whatever limits it has."""
         limits = numbers.limits
-        if limits is not None and outside(limits, self.features.evaluate(x, self.layout, np)).any():
+        if limits is not None and outside(limits, self.features_of(x)).any():
             numbers = numbers.free
         return self.parts_at(numbers, x).raw
 

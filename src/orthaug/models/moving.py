@@ -379,6 +379,10 @@ class MotionDynamics(MotionField, AutodiffDynamics):
     def features_at(self, states: Matrix, inputs: Matrix) -> Float[np.ndarray, "T nz"]:
         return np.asarray(self.seen(states.T, inputs.T, np)).T
 
+    def features_of(self, points: Matrix) -> Float[np.ndarray, "N nz"]:
+        """Return the learner's features at states and inputs (N, nx + nu)."""
+        return self.features_at(*np.split(points, [self.states], axis=1))
+
     @property
     def state_names(self) -> tuple[str, ...]:
         return self.motion.names_of_states

@@ -372,7 +372,7 @@ def learner_rows(
     Outputs are filtered by the noise model, and multiplied by `weight`, (ny, ny), or (N, ny, ny)
     without a noise model.
     """
-    z = np.asarray(form.features.evaluate(x, form.layout, np))
+    z = form.features_of(x)
     scaled = (z - np.asarray(numbers.centre)) / np.asarray(numbers.halfwidth)
     if noise is not None:
         e = np.zeros((len(x), len(form.outputs)))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from orthaug._base.checks import Matrix, check_label, check_type, check_unique, is_number
+from orthaug._base.checks import Matrix, check_finite, check_label, check_type, check_unique
 from orthaug._base.errors import LONGEST, InputError, show
 from orthaug._base.views import NotebookView
 from orthaug.data.channels import Channel
@@ -49,11 +49,7 @@ class Parameter:
     def __post_init__(self) -> None:
         check_parameter_name(self.name)
         check_label(self.unit, f"the unit of '{self.name}'")
-        if not is_number(self.initial):
-            raise InputError(
-                f"the initial value of '{self.name}' must be a finite number; got "
-                f"{show(self.initial)}."
-            )
+        check_finite(self.initial, f"the initial value of '{self.name}'")
         check_bounds(self.name, self.min, self.max)
 
 
@@ -188,10 +184,7 @@ class Baseline(NotebookView):
                     "underscores, not starting with a digit, and no keyword; "
                     f"{', '.join(sorted(RESERVED))} are taken."
                 )
-            if not is_number(value):
-                raise InputError(
-                    f"the constant '{name}' must be a finite number; got {show(value)}."
-                )
+            check_finite(value, f"the constant '{name}'")
         terms = _unify(terms)
         parameters = {t.parameter: _parameter(t) for t in terms if not t.fixed}
         baseline = cls(tuple(parameters.values()), tuple(terms), tuple(sorted(constants.items())))
@@ -406,10 +399,8 @@ def _unify(terms: Sequence[Term]) -> list[Term]:
             ("lower bound", term.min),
             ("upper bound", term.max),
         ):
-            if value is not None and not is_number(value):
-                raise InputError(
-                    f"the {what} of '{term.parameter}' must be a finite number; got {show(value)}."
-                )
+            if value is not None:
+                check_finite(value, f"the {what} of '{term.parameter}'")
         for attribute in _SHARED:
             value = getattr(term, attribute)
             if value is not None and said.setdefault((term.parameter, attribute), value) != value:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from orthaug._base.checks import check_unique, is_number
+from orthaug._base.checks import check_finite, check_unique, is_number
 from orthaug._base.errors import InputError, show
 from orthaug.data.expressions import FUNCTIONS, is_name
 from orthaug.physics.parameters import PhysicalParameter, check_parameters
@@ -97,11 +97,7 @@ class Controller:
         if parameters:
             check_parameters(parameters, constants, FUNCTIONS)
         for name, value in constants.items():
-            if not is_number(value):
-                raise InputError(
-                    f"the controller's constant '{name}' must be a finite number; got "
-                    f"{show(value)}."
-                )
+            check_finite(value, f"the controller's constant '{name}'")
         return cls(
             outputs=tuple((name, str(text)) for name, text in outputs.items()),
             states=tuple(states),

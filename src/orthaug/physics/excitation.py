@@ -17,7 +17,7 @@ from orthaug._base.errors import RankError
 from orthaug._base.lines import plural
 from orthaug.data.regressors import Layout
 from orthaug.physics.baseline import Baseline
-from orthaug.physics.projection import Factor
+from orthaug.physics.projection import Projection
 
 RANK_TOLERANCE = 1e-13  # σmin/σmax of the unit-norm columns below which Φ counts as rank-deficient
 
@@ -154,4 +154,4 @@ def identifiability(
     finite = np.isfinite(phi).all(axis=(1, 2))  # a logarithm or a root has no value at some of them
     if finite.sum() < nt:
         return excitation(np.zeros((1, nt)), baseline.names)
-    return excitation(Factor.of_blocks([phi[finite]]).r, baseline.names)
+    return excitation(Projection.factor(phi[finite]).r, baseline.names)

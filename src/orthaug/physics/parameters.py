@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from orthaug._base.checks import Matrix, Vector, check_label, check_unique, is_number, nearest
-from orthaug._base.errors import InputError, show
+from orthaug._base.checks import Matrix, Vector, check_finite, check_label, check_unique, nearest
+from orthaug._base.errors import InputError
 from orthaug.data.expressions import RESERVED, SAMPLING_TIME, Expression, is_name, parse_named
 from orthaug.data.headers import split_header, unit_of_time
 from orthaug.physics.baseline import Baseline, Parameter, check_bounds
@@ -384,18 +384,14 @@ def check_parameters(
                 f"{', '.join(sorted(taken))} are taken{index}."
             )
     for name, value in constants.items():
-        if not is_number(value):
-            raise InputError(f"the constant '{name}' must be a finite number; got {show(value)}.")
+        check_finite(value, f"the constant '{name}'")
     for p in parameters:
         check_not_sampling_time(p.name, "a parameter")
         if p.name in constants:
             raise InputError(
                 f"'{p.name}' is a physical parameter and a constant; give one of them another name."
             )
-        if not is_number(p.initial):
-            raise InputError(
-                f"the initial value of '{p.name}' must be a finite number; got {show(p.initial)}."
-            )
+        check_finite(p.initial, f"the initial value of '{p.name}'")
         check_label(p.unit, f"the unit of '{p.name}'")
         check_bounds(p.name, p.min, p.max)
         if not p.min <= p.initial <= p.max:

@@ -5,7 +5,7 @@ Everything here is orthogonal factorisation. `ΦᵀΦ` is never formed, let alon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,32 +18,30 @@ _ROUNDING = 1e-13  # of the size of what is summed: below it a direction moves n
 
 
 @dataclass(frozen=True, eq=False)
-class Factor:
-    """R of Φ, for rows of Φ that are not kept: `Φ scale = q r` with orthonormal q.
+class Projection:
+    """The QR of Φ with its rows weighted per output: `Φ scale = q r` with orthonormal q.
 
     `r` (nθ, nθ) is upper triangular. `scale` (nθ,) multiplies the columns; its entries are powers
-    of two, which is exact.
+    of two, which is exact. `phi` and `q` are (N, ny, nθ).
     """
 
     r: Float[np.ndarray, "nt nt"]
     scale: Vector
+    phi: Float[np.ndarray, "N ny nt"]
+    q: Float[np.ndarray, "N ny nt"]
 
     @classmethod
-    def of_blocks(cls, blocks: Iterable[Float[np.ndarray, "n ny nt"]]) -> Factor:
-        """Return the factor of blocks of rows, one at a time (tree QR).
-
-        R of the blocks before is stacked upon the next block.
-        """
-        r = scale = None
-        for block in blocks:
-            # −1 has no meaning without columns
-            rows = block.reshape(block.shape[0] * block.shape[1], block.shape[2])
-            if scale is None or r is None:
-                scale, r = _scale(rows), np.zeros((0, rows.shape[1]))
-            r = np.asarray(np.linalg.qr(np.concatenate([r, rows * scale]), mode="r"))
-        if r is None or scale is None:
-            raise ValueError("a factor needs at least one block of rows")
-        return cls(r, scale)
+    def factor(cls, phi: Float[np.ndarray, "N ny nt"]) -> Projection:
+        """Return the projection by Householder QR of the stacked (N·ny, nθ) matrix."""
+        rows, ny, nt = phi.shape
+        if nt == 0:
+            return cls(np.zeros((0, 0)), np.zeros(0), phi, phi)
+        stacked = phi.reshape(rows * ny, nt)
+        scale = powers_of_two(np.abs(stacked).max(axis=0, initial=0.0))
+        q, r = scipy.linalg.qr(  # pyright: ignore[reportAssignmentType]  (its stubs do not know `mode`)
+            stacked * scale, mode="economic", overwrite_a=True, check_finite=False
+        )
+        return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
 
     @property
     def to_coordinates(self) -> Matrix:
@@ -99,27 +97,6 @@ class Factor:
             else basis.T
         )
 
-
-@dataclass(frozen=True, eq=False)
-class Projection(Factor):
-    """A factor with its rows weighted per output: `phi` and orthonormal `q`, both (N, ny, nθ)."""
-
-    phi: Float[np.ndarray, "N ny nt"]
-    q: Float[np.ndarray, "N ny nt"]
-
-    @classmethod
-    def factor(cls, phi: Float[np.ndarray, "N ny nt"]) -> Projection:
-        """Return the projection by Householder QR of the stacked (N·ny, nθ) matrix."""
-        rows, ny, nt = phi.shape
-        if nt == 0:
-            return cls(np.zeros((0, 0)), np.zeros(0), phi, phi)
-        stacked = phi.reshape(rows * ny, nt)
-        scale = _scale(stacked)
-        q, r = scipy.linalg.qr(  # pyright: ignore[reportAssignmentType]  (its stubs do not know `mode`)
-            stacked * scale, mode="economic", overwrite_a=True, check_finite=False
-        )
-        return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
-
     def coordinates(self, values: Float[np.ndarray, "N ny"]) -> Vector:
         """Return Qᵀv, (nθ,): the part of stacked outputs that the physics can express."""
         return np.tensordot(self.q, values, axes=([0, 1], [0, 1]))
@@ -161,10 +138,6 @@ class Projection(Factor):
         for _ in range(2):
             values = values - self.q @ self.coordinates(values)
         return values
-
-
-def _scale(rows: Matrix) -> Vector:
-    return powers_of_two(np.abs(rows).max(axis=0, initial=0.0))
 
 
 def powers_of_two(largest: Vector) -> Vector:

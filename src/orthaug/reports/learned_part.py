@@ -101,7 +101,7 @@ class LearnedPart:
             return np.concatenate(found)[: len(x)]
 
         with np.errstate(all="ignore"):
-            seen = np.asarray(model.form.seen(points[:, :size].T, points[:, size:].T, np)).T
+            seen = model.form.features_of(points)
         motion, units = model.form.motion, units_of(model)
         features = tuple(str(entry) for entry in model.form.features)
         return cls(
@@ -139,7 +139,7 @@ class LearnedPart:
             units=tuple(units.get(name, "") for name in features),
             variables=tuple(str(lag) for lag in form.layout),
             points=points,
-            seen=np.asarray(form.features.evaluate(points, form.layout, np)),
+            seen=form.features_of(points),
             values=at(points),
             at=at,
         )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from orthaug._base.lines import join_words
+from orthaug._base.lines import first_words, join_words
 from orthaug.analysis.budget import SURE_SHARE
 from orthaug.analysis.changes import Change
 from orthaug.analysis.findings import BiasResult
@@ -185,12 +185,11 @@ def _agreement(result: CompareResult) -> str:
 
 def _settings_text(result: CompareResult) -> str:
     """Return the settings to which a difference between saved results may be due."""
-    keys = [one.key for one in result.settings or ()]
+    keys = [f"`{one.key}`" for one in result.settings or ()]
     if not keys:
         return "Their settings are the same."
-    more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
-    shown = ", ".join(f"`{key}`" for key in keys[:_MOST_KEYS])
-    return f"They differ in {shown}{more}; change one at a time to see what makes the difference."
+    shown = first_words(keys, _MOST_KEYS)
+    return f"They differ in {shown}; change one at a time to see what makes the difference."
 
 
 def _best_model(rows: Sequence[RowResult], errors: Mapping[str, float]) -> str:

@@ -187,7 +187,7 @@ class RecoverResult(ResultHeader):
             outcomes: number of the term, and rows with `kind`, `name` and `parameters`.
         """
         drawn = [_draw(i, one, planted, true) for i, one in enumerate(outcomes)]
-        choices = _choices(outcomes, true, drawn)
+        choices = _choices(outcomes, true)
         twice = {
             kind: next((c for c in choices if c["kind"] == kind), None)
             for kind in (DECLARED, "rows")
@@ -334,9 +334,7 @@ def _relative_error(parameters: Mapping[str, Any], true: Mapping[str, float]) ->
 
 
 def _choices(
-    outcomes: Sequence[Mapping[str, Any]],
-    true: Mapping[str, float],
-    drawn: Sequence[Mapping[str, object]],
+    outcomes: Sequence[Mapping[str, Any]], true: Mapping[str, float]
 ) -> list[dict[str, object]]:
     """Return the row of every choice, the declared one first, the others by their error."""
     compared = [one for one in outcomes if len(one["rows"]) > 1]

@@ -38,10 +38,7 @@ def track_text(result: TrackResult) -> str:
         f"memory      {memory} (forgetting {result.forgetting:.8g}), worth "
         f"{result.effective_rows:.0f} rows",
     ]
-    alarms = [
-        f"the residual left its band at {alarm.time:g} s (row {alarm.row})"
-        for alarm in result.alarms
-    ]
+    alarms = [str(alarm) for alarm in result.alarms]
     lines += [f"alarm       {sentence}" for sentence in alarms] or ["alarm       none"]
     if alarms:
         state = "is still out of it" if result.alarmed else "has come back"

@@ -141,7 +141,7 @@ def _of_lagged(model: Model[LaggedDynamics], record: Record) -> LearnedLineariza
     with np.errstate(all="ignore"):
         target = model.learner_at(x) if len(x) else np.zeros((0, len(form.outputs)))
         phi = np.asarray(form.phi(x, np))
-        z = np.asarray(form.features.evaluate(x, form.layout, np))
+        z = form.features_of(x)
     finite = (
         np.isfinite(target).all(axis=1)
         & np.isfinite(phi).all(axis=(1, 2))
@@ -187,7 +187,7 @@ def _of_motion(model: Model[MotionDynamics], record: Record) -> LearnedLineariza
     coordinates, count = motion.coordinates, len(model.theta)
     known = motion.values(x.T, u.T, coordinates.physical(model.theta), np)
     own = signals_seen(model)
-    z = np.asarray(form.seen(x.T, u.T, np)).T
+    z = form.features_at(x, u)
     units = model.units | {parameter.name: parameter.unit for parameter in motion.parameters}
     return LearnedLinearization(
         target=target,

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import span
 from orthaug.data.terms import TermLibrary
 from orthaug.fitting.colour import correlation_length
 from orthaug.fitting.criteria import Prediction
@@ -34,6 +34,7 @@ _FEWEST_BLOCKS = 8  # whose signs can make 256 sums
 _MEMORIES = 3  # times as long a block as the products remember each other
 _FEWEST_ROWS = 160
 _DRAWS = 1999
+_RANK = 1e-7  # of the largest singular value of columns of size 1
 _SEED = 20_261_123
 
 
@@ -81,7 +82,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     library = TermLibrary.of((), 0, (), [*lags, *squares])
     runs = TermRuns.of(problem, library, Prediction())
     known, functions, target = _rows(runs, len(lags))
-    q = _basis(np.column_stack([known, np.ones(len(known))]))
+    q = span(np.column_stack([known, np.ones(len(known))]), _RANK)
     error = target - q @ (q.T @ target)
     if len(error) < _FEWEST_ROWS:
         return None
@@ -93,7 +94,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     )
     if not len(own):
         return None
-    count = _blocks(_basis(functions[:, own]) * error[:, None])
+    count = _blocks(span(functions[:, own], _RANK) * error[:, None])
     if count < _FEWEST_BLOCKS:
         return None
     blocks = np.linspace(0, len(error), count + 1).astype(int)[:-1]
@@ -101,7 +102,7 @@ def nonlinearity(problem: Problem, lags: Sequence[str], draws: int = _DRAWS) -> 
     unused = _without_own_block(error, q, blocks)
 
     def p_value(columns: np.ndarray) -> float:
-        basis = _basis(functions[:, columns])
+        basis = span(functions[:, columns], _RANK)
         sums = np.add.reduceat(basis * unused[:, None], blocks, axis=0)
         statistic = float(np.sum((basis.T @ error) ** 2))
         return float((1 + np.sum(np.sum((signs @ sums) ** 2, axis=1) >= statistic)) / (1 + draws))
@@ -144,9 +145,3 @@ def _rows(runs: TermRuns, linear: int) -> tuple[Matrix, Matrix, Vector]:
         functions.append(terms[:, linear:])
         targets.append(target)
     return np.concatenate(known), np.concatenate(functions), np.concatenate(targets)
-
-
-def _basis(columns: Float[np.ndarray, "N k"]) -> Float[np.ndarray, "N r"]:
-    size = np.linalg.norm(columns, axis=0)
-    u, sigma, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    return u[:, sigma > 1e-7 * sigma.max(initial=0.0)]

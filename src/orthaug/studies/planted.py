@@ -207,11 +207,11 @@ class LaggedSystem:
             width = median_size(argument.values)
             moves = any(name in argument.text for name in problem.outputs)
             if width is not None and moves:
-                return self._memory(argument.text, argument.values)
+                return self._memory(argument.text)
         argument = Catalogue.of_problem(problem).arguments[0]
-        return self._memory(argument.text, argument.values)
+        return self._memory(argument.text)
 
-    def _memory(self, on: str, values: Vector) -> Suspect:
+    def _memory(self, on: str) -> Suspect:
         problem = self.fit.problem
         step = problem.record.sampling_time
         constants = {SAMPLING_TIME: step} | dict(problem.baseline.constants)
