@@ -36,7 +36,7 @@ from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import Coordinates
 
 _FEW = 8  # states and parameters; programs of more are slow to compile
-_FEW, _FEW_LEARNED = 4, 2  # substeps that are one piece; more are a loop, which compiles faster
+_FEW = 2  # substeps that are one piece; more are loops, which compile in half the time
 _MOST_KEPT = 32  # substeps whose stages are kept in memory until their slopes are multiplied
 _FUSED = 250  # slopes of a state up to which the stages of a step are one piece
 
@@ -81,9 +81,7 @@ def sample_slopes(
     h = pace * form.sampling_time / form.substeps
     # Fused, XLA computes what a stage finds anew for each use of it, of which large slopes have
     # many; and a large field is written once into a program
-    few = form.substeps <= (_FEW_LEARNED if learned else _FEW) and not (
-        form.large and form.substeps > 1
-    )
+    few = form.substeps <= (1 if form.large else _FEW)
     over_substeps = _unrolled if few else jax.lax.scan
     small = few and form.states * form.unknowns <= _FUSED and not form.large
     given = form, numbers, h, _unrolled if small else jax.lax.scan
