@@ -157,7 +157,7 @@ class Suspect:
         Args:
             kind: one of `KINDS`.
             on: any expression, such as `"v[k-1]"` or `"(y[k-1] - y[k-2])/Ts"`.
-            width: in the unit of x, positive; `data_width` suggests one from data.
+            width: in the unit of x, positive; the median of |x| where it is not zero is usual.
             time_constant: of a lag, in s, positive.
             output, coefficient, constants: as in `Suspect`.
             name: default the kind with its arguments, such as `coulomb(v[k-1])`.
@@ -451,7 +451,8 @@ def suspect_text(
         on = " ".join(on.split())
     if _KINDS[kind].width and width is None:
         raise InputError(
-            f"a suspect of kind {kind} needs `width`, in the unit of {on}; data_width suggests one."
+            f"a suspect of kind {kind} needs `width`, in the unit of {on}. Usual is the median of "
+            "its size where it is not zero."
         )
     if width is not None and not _KINDS[kind].width:
         raise InputError(f"a suspect of kind {kind} takes no `width`; got {width!r}.")
