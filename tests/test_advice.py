@@ -843,7 +843,7 @@ def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
     assert first.change["baseline.terms"][-1]["regressor"] == "v[k-1]*u[k-1]"
     assert "in place of the learner" in first.text
     assert first.change["baseline.terms"][-1]["selected"] is True
-    assert "No learner then imitates a and b; other forms of the term" in first.text
+    assert "No learner then imitates a and b; other forms of a term" in first.text
     assert first.after < 1.05 * first.before
 
 
@@ -906,7 +906,7 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
     (advice,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
     assert "is as good" in advice.text and "may be chance" not in advice.text
     assert advice.text.endswith(
-        "imitates a and b; other forms of the term that fit as well count in their intervals."
+        "imitates a and b; other forms of a term that fit as well count in their intervals."
     )
     assert "does not surely improve it, and which is as good without the learner." in trials.text
 

@@ -456,7 +456,7 @@ def _freed_text(names: Sequence[str]) -> str:
         return ""
     intervals = "its interval" if len(names) == 1 else "their intervals"
     return (
-        f" No learner then imitates {join_words(names)}; other forms of the term that fit as well "
+        f" No learner then imitates {join_words(names)}; other forms of a term that fit as well "
         f"count in {intervals}."
     )
 
