@@ -26,13 +26,13 @@ from orthaug.commands.advice import (
     ValidationRows,
     _conclude_trials,
     _tried,
-    apply_change,
 )
 from orthaug.commands.motion import _has_term
 from orthaug.commands.proposals import (
     Proposal,
     _delay,
     _unique_proposals,
+    apply_change,
     mending_proposals,
     noise_model_proposals,
 )
@@ -843,8 +843,56 @@ def test_the_term_that_explains_the_learner_is_tried_in_its_place(tmp_path):
     assert first.change["baseline.terms"][-1]["regressor"] == "v[k-1]*u[k-1]"
     assert "in place of the learner" in first.text
     assert first.change["baseline.terms"][-1]["selected"] is True
-    assert "No learner then imitates a and b; other forms of the term" in first.text
+    assert "No learner then imitates a and b; other forms of a term" in first.text
     assert first.after < 1.05 * first.before
+
+
+ROOMS = """
+[data]
+sampling_time = 1.0
+inputs = ["heat", "sun"]
+outputs = ["north", "south"]
+train = { files = ["run.csv"] }
+[lags]
+na = 1
+nb = 1
+[[baseline.terms]]
+parameter = "a"
+regressor = "north[k-1]"
+output = "north"
+[[baseline.terms]]
+parameter = "b"
+regressor = "heat[k-1]"
+output = "north"
+[[baseline.terms]]
+parameter = "c"
+regressor = "south[k-1]"
+output = "south"
+[learner]
+hidden = [4]
+[training]
+restarts = 1
+focus = "prediction"
+"""
+
+
+def test_terms_of_two_equations_take_the_place_of_the_learner_together(tmp_path):
+    """Two rooms without the sun: its bend was named, and one term at a time was tried beside
+    the learner, which gained nothing."""
+    random = np.random.default_rng(2)
+    heat, sun = (np.repeat(random.uniform(0, 2, 50), 10) for _ in range(2))
+    rooms = np.zeros((500, 2))
+    for k in range(1, 500):
+        north, south = rooms[k - 1] + 0.002 * random.normal(size=2)
+        warm = 0.9 * north + 0.1 * heat[k - 1] + 0.2 * sun[k - 1]
+        rooms[k] = warm, 0.8 * south + 0.3 * sun[k - 1]
+    data = np.column_stack([heat, sun, rooms])
+    fitted = oa.fit_spec(str(put(tmp_path, ROOMS, data, "heat,sun,north,south")))
+    first = fitted.result.advice[0]
+    assert first.change["learner.kind"] == "none"
+    added = [(one["regressor"], one["output"]) for one in first.change["baseline.terms"][3:]]
+    assert sorted(added) == [("sun[k-1]", "north"), ("sun[k-1]", "south")]
+    assert "in place of the learner" in first.text and first.after < 1.05 * first.before
 
 
 def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
@@ -858,7 +906,7 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
     (advice,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
     assert "is as good" in advice.text and "may be chance" not in advice.text
     assert advice.text.endswith(
-        "imitates a and b; other forms of the term that fit as well count in their intervals."
+        "imitates a and b; other forms of a term that fit as well count in their intervals."
     )
     assert "does not surely improve it, and which is as good without the learner." in trials.text
 

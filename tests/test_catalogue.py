@@ -60,6 +60,40 @@ def test_what_the_physics_has_is_no_suspect(tmp_path, physics, known, learner):
     assert other in names
 
 
+UNREAD = """
+[motion.states]
+x = { derivative = "b*u - c*x", start = "y", learned = true }
+z = { derivative = "u - b*z", start = 0 , learned = true }
+[motion.outputs]
+y = "x + z"
+[motion.parameters]
+b = { initial = 0.5 }
+c = { initial = 0.2 }
+"""
+LAGGED_UNREAD = """
+[lags]
+na = 1
+nb = 1
+[[baseline.terms]]
+parameter = "a"
+regressor = "y[k-1]"
+"""
+
+
+@pytest.mark.parametrize(
+    ("physics", "multiples"),
+    [
+        (LAGGED_UNREAD, ["multiple of u[k-1]"]),
+        (UNREAD, ["multiple of z in x", "multiple of x in z"]),
+        (LAGGED, []),
+        (MOTION, []),
+    ],
+)
+def test_a_multiple_of_what_an_equation_does_not_read_may_be_missing(tmp_path, physics, multiples):
+    names = [one["name"] for one in suspects(tmp_path, physics, "mlp")]
+    assert [name for name in names if name.startswith("multiple")] == multiples
+
+
 def test_a_bias_of_a_parameter_next_to_zero_is_not_in_per_cent_of_it(tmp_path):
     """A record without noise gives a parameter that is not there the size of rounding."""
     extra = LAGGED.replace("sqrt(y[k-1])", "u[k-2]")

@@ -240,14 +240,16 @@ def test_the_terminal_ends_with_the_verdict_that_the_page_begins_with():
     assert verdict.trust.startswith("Take “orthogonal”: the RMS error of its free run")
 
 
-def test_feedback_is_no_doubt_beside_a_noise_model_that_leaves_white_errors():
-    """The warning said 'consistent here', and the verdict 'which biases the estimates'."""
+@pytest.mark.parametrize("noise", [[object()], None])
+def test_feedback_is_no_doubt_where_errors_are_white(noise):
+    """The warning said 'consistent here', and the verdict 'which biases the estimates': of six
+    loops with complete physics and white noise on the sensor, every interval held the truth."""
     looped = [Warning("closed_loop", "")]
-    found = fit_verdict(fitted(residuals=told(), warnings=looped, noise=[object()]))
+    found = fit_verdict(fitted(residuals=told(), warnings=looped, noise=noise))
     assert found.level == "good" and "feedback" not in found.trust
-    assert "feedback" in fit_verdict(fitted(residuals=told(), warnings=looped, noise=None)).trust
+    assert "read a as physics" in found.use and "Do not" not in found.use
     coloured = told().model_copy(update={"verdict": "equation_noise"})
-    left = fit_verdict(fitted(residuals=coloured, warnings=looped, noise=[object()]))
+    left = fit_verdict(fitted(residuals=coloured, warnings=looped, noise=noise))
     assert left.level == "care" and "under feedback" in left.trust
 
 

@@ -1,9 +1,10 @@
 """Catalogue of the terms that a physics may lack, for difference equations and for motions.
 
-It has the usual suspects (friction, drag, hardening, bent inputs, an offset), products of two lags,
-and families: a line of `FAMILIES` is a form whose width or power is profiled, and each member is
-tried on everything that the learner sees. What a term can act on, and which outputs or equations
-may lack it, is all that differs between kinds of physics.
+It has the usual suspects (friction, drag, hardening, bent inputs, an offset, a multiple of what an
+equation does not read), products of two lags, and families: a line of `FAMILIES` is a form whose
+width or power is profiled, and each member is tried on everything that the learner sees. What a
+term can act on, and which outputs or equations may lack it, is all that differs between kinds of
+physics.
 """
 
 from __future__ import annotations
@@ -111,6 +112,8 @@ class Argument(NamedTuple):
     text: str
     values: Vector
     kinds: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    """Places whose physics does not read it, where already a multiple of it may be missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +141,11 @@ class Catalogue:
         """Return the catalogue for physics on lagged signals."""
         layout, outputs, x = problem.layout, problem.outputs, problem.rows.x
         constants, arguments = dict(problem.baseline.constants), []
+        read: dict[str, set[str]] = {}  # channels, by output; of a function they are not known
+        for term in problem.baseline.terms:
+            lags = parse(term.regressor, constants).lags
+            for name in outputs if term.output is None else (term.output,):
+                read.setdefault(name, set()).update(lag.channel for lag in lags)
 
         def evaluate(text: str) -> Vector:
             return evaluate_rows(parse(text), x, layout, f"'{text}'")
@@ -146,11 +154,13 @@ class Catalogue:
             lags = sorted(lag for lag in layout if lag.channel == channel)
             first, several = str(lags[0]), len(lags) > 1
             values = evaluate(first)
+            unread = tuple(name for name in read if channel not in read[name])
             if channel not in outputs:
-                arguments.append(Argument(first, values, _INPUT))
+                arguments.append(Argument(first, values, _INPUT, unread))
                 continue
             root = ("square_root",) if is_level(values) else ()
-            arguments.append(Argument(first, values, (*(_POSITION if several else _SINGLE), *root)))
+            kinds = (*(_POSITION if several else _SINGLE), *root)
+            arguments.append(Argument(first, values, kinds, unread))
             if several:
                 step = f"{first} - {lags[1]}"
                 arguments.append(Argument(step, evaluate(step), _VELOCITY))
@@ -203,13 +213,24 @@ class Catalogue:
         names, features = motion.names_of_states, list(dict.fromkeys(features))
         hidden = {*names, *motion.inputs} - {*motion.visible}
         more = [text for text in features if text not in (*names, *motion.inputs)]
+        places = tuple(motion.states[place].name for place in usual_places(motion))
+        read = {
+            place: motion.names_in(motion.equations[place])
+            for place in places
+            if motion.functions is None
+        }
+
+        def argument(name: str, values: Vector, kinds: tuple[str, ...]) -> Argument:
+            unread = tuple(place for place in read if name not in read[place])
+            return Argument(name, values, kinds, unread)
+
         arguments = [
-            *(Argument(name, row, _STATE) for name, row in zip(names, x.T, strict=True)),
-            *(Argument(name, row, _INPUT) for name, row in zip(motion.inputs, u.T, strict=True)),
+            *(argument(name, row, _STATE) for name, row in zip(names, x.T, strict=True)),
+            *(argument(name, row, _INPUT) for name, row in zip(motion.inputs, u.T, strict=True)),
             *(Argument(text, evaluate(text), _FEATURE) for text in more),
         ]
         return cls(
-            tuple(motion.states[place].name for place in usual_places(motion)),
+            places,
             tuple(a for a in arguments if np.ptp(a.values) > 0 and a.text not in hidden),
             tuple(Argument(text, evaluate(text)) for text in features[:_MOST_ARGUMENTS]),
             (),  # no products of states: a motion's families and usual terms have sufficed
@@ -223,14 +244,17 @@ class Catalogue:
         for place in self.places:
             label = self._label(place)
             for argument in self.arguments:
+                on = argument.text
+                if place in argument.unread:
+                    found.append(self.of_text(on, on, place, f"multiple of {on}{label}"))
                 for kind in argument.kinds:
                     width = median_size(argument.values) if kind in WIDTHS else None
                     if kind in ODD_JUMPS and not changes_sign(argument.values):
                         continue  # what jumps there is as good as a constant
                     if kind in WIDTHS and width is None:
                         continue
-                    name = f"{kind} of {argument.text}{label}"
-                    found.append(self.of_kind(kind, argument.text, width, place, name))
+                    name = f"{kind} of {on}{label}"
+                    found.append(self.of_kind(kind, on, width, place, name))
             found.append(self.of_kind("offset", None, None, place, f"offset{label}"))
         return tuple(found)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +20,13 @@ from orthaug._base.parallel import iterate_results, run_all
 from orthaug._base.progress import LOG
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
-from orthaug.commands.opening import job_of_change
 from orthaug.commands.proposals import (
     Proposal,
+    changed_job,
     mending_proposals,
     noise_model_proposals,
     proposals,
 )
-from orthaug.commands.spec import spec_model
 from orthaug.data.preparation import prepare
 from orthaug.data.record import Record
 from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
@@ -135,20 +133,6 @@ class Trials:
     settled: dict[str, Any]
     """What the fit has found, as a change of the spec: a search would cost most."""
 
-    def changed_job(self, change: dict[str, object]) -> Job:
-        """Return the job of a changed spec, with what the fit has found.
-
-        Raises:
-            InputError: the change is not possible; ValueError likewise.
-        """
-        return job_of_change(
-            self.job,
-            spec_model().model_validate(
-                apply_change(self.job.declaration, self.settled | change),
-                context={"folder": self.job.path.parent},
-            ),
-        )
-
     def run(
         self,
         job: Job,
@@ -180,7 +164,7 @@ class Trials:
     def of(self, proposal: Proposal) -> ProposalErrors:
         """Return the trial of a proposal."""
         try:
-            job = self.changed_job(proposal.change)
+            job = changed_job(self.job, self.settled | proposal.change)
         except (InputError, ValueError) as error:
             LOG.info("%s was not tried: %s", proposal.words, error)
             return ProposalErrors(proposal, None)
@@ -219,20 +203,6 @@ class Trials:
             return tried
         more = [one for one in tried if one.pieces and _ratio(one, own).code == "helps"]
         return [again, *more]
-
-
-def apply_change(declaration: dict[str, object], change: dict[str, Any]) -> dict[str, Any]:
-    """Return a declaration with the values of a change; dots in a key separate its levels."""
-    found = deepcopy(declaration)
-    for key, value in change.items():
-        *path, last = key.split(".")
-        place = found
-        for part in path:
-            place = place.setdefault(part, {})
-            if not isinstance(place, dict):
-                raise InputError(f"'{key}': '{part}' is no table.")
-        place[last] = value
-    return found
 
 
 def advise(
@@ -481,7 +451,7 @@ def _freed_text(names: Sequence[str]) -> str:
         return ""
     intervals = "its interval" if len(names) == 1 else "their intervals"
     return (
-        f" No learner then imitates {join_words(names)}; other forms of the term that fit as well "
+        f" No learner then imitates {join_words(names)}; other forms of a term that fit as well "
         f"count in {intervals}."
     )
 

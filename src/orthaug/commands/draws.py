@@ -13,12 +13,12 @@ from orthaug._base.checks import Matrix, check_choice, check_count, check_number
 from orthaug._base.errors import InputError, TrainingError
 from orthaug.analysis.doubts import NOISE_ONLY, doubt
 from orthaug.analysis.examination import with_verdict
-from orthaug.commands.advice import apply_change
 from orthaug.commands.design import design_for
 from orthaug.commands.fit import FitReport, fit_variant
 from orthaug.commands.job import AS_DECLARED, PHYSICS_ONLY, Job, Variant
 from orthaug.commands.opening import pose_job
 from orthaug.commands.parts import FilePart
+from orthaug.commands.proposals import apply_change
 from orthaug.commands.spec import Spec, spec_model
 from orthaug.data.gaps import filled_record
 from orthaug.data.record import Experiment, Record

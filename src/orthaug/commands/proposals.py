@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from orthaug._base.errors import InputError
 from orthaug._base.lines import join_words, plural
 from orthaug.analysis.changes import Change
 from orthaug.analysis.closed_loop import exchanged_with_output
@@ -14,7 +16,9 @@ from orthaug.analysis.findings import LateInputResult
 from orthaug.analysis.input_timing import is_stepped, sort_holds
 from orthaug.analysis.wild_rows import wild_row_mendings
 from orthaug.commands.job import MISSING_STATE, Job, declared_output
+from orthaug.commands.opening import job_of_change
 from orthaug.commands.parts import training_unit_faults
+from orthaug.commands.spec import spec_model
 from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
 from orthaug.data.wild import mendings
@@ -69,6 +73,31 @@ class Proposal:
         if self.positive is None:
             return True
         return bool(fit.parameters.loc[self.positive, "value"] > 0)
+
+
+def apply_change(declaration: dict[str, object], change: dict[str, Any]) -> dict[str, Any]:
+    """Return a declaration with the values of a change; dots in a key separate its levels."""
+    found = deepcopy(declaration)
+    for key, value in change.items():
+        *path, last = key.split(".")
+        place = found
+        for part in path:
+            place = place.setdefault(part, {})
+            if not isinstance(place, dict):
+                raise InputError(f"'{key}': '{part}' is no table.")
+        place[last] = value
+    return found
+
+
+def changed_job(job: Job, change: dict[str, Any]) -> Job:
+    """Return the job of a changed spec on the same data.
+
+    Raises:
+        InputError: the change is not possible; ValueError likewise.
+    """
+    declared = apply_change(job.declaration, change)
+    context = {"folder": job.path.parent}
+    return job_of_change(job, spec_model().model_validate(declared, context=context))
 
 
 def mending_proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
@@ -315,19 +344,22 @@ def _suspected_terms(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal
 
 
 def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator[Proposal]:
-    """Yield the term that explains most of the learner, with no learner beside it."""
-    causes = {row.bias.cause for row in result.parameters if row.bias is not None}
-    most = [
-        entry
-        for entry in (result.bias or () if fit.learns else ())
-        if (entry.explained or 0.0) > _MOST and entry.memory is None and entry.name in causes
-    ]
-    for entry in sorted(most, key=lambda entry: -(entry.explained or 0.0))[:1]:
-        place, size = entry.equation or entry.output, entry.coefficient_found
-        for term in _term(job, entry.expression, place, size):
-            change = term.change | {"learner.kind": "none"}
-            words = f"{term.words} in place of the learner"
-            yield replace(term, words=words, change=change, replaces=True)
+    """Yield the terms that explain most of the learner together, with no learner beside them."""
+    biases = [row.bias for row in result.parameters if row.bias is not None]
+    causes = {bias.cause for bias in biases if (bias.share or 0.0) > _MOST}
+    causes |= {name for cause in causes for name in cause.split(" and ")}  # of several equations
+    change: dict[str, Any] = {}
+    words = []
+    for entry in result.bias or () if fit.learns else ():
+        if entry.name in causes and entry.memory is None:
+            place, size = entry.equation or entry.output, entry.coefficient_found
+            beside = changed_job(job, change) if change else job
+            for term in _term(beside, entry.expression, place, size):
+                change |= term.change
+                words.append(term.words)
+    if words:
+        change |= {"learner.kind": "none"}
+        yield Proposal(f"{join_words(words)} in place of the learner", change, replaces=True)
 
 
 def _term(

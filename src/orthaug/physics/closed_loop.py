@@ -54,7 +54,7 @@ class ClosedLoop(Motion):
         plant = [e for name, e in self.equations.items() if name not in self.discrete_states]
         measured = zip(self.outputs, self.observations, strict=True)
         seen = [e for output, e in measured if output.name not in self.held]
-        return self._names_in(*plant, *seen)
+        return self.names_in(*plant, *seen)
 
     @property
     def plant(self) -> Motion:
@@ -173,7 +173,7 @@ class ClosedLoop(Motion):
                 "An input that follows from references alone is an input of the data."
             )
         for output, expression in zip(self.outputs, self.observations, strict=True):
-            through = self._names_in(expression) & set(self.held)
+            through = self.names_in(expression) & set(self.held)
             if through and output.name in self.read_at_once:
                 raise _algebraic(output.name, min(through))
 

@@ -297,9 +297,9 @@ class Motion(NotebookView):
         """Raise InputError unless every parameter is used and every output depends on a state."""
         used: set[str] = set()
         for state in self.states:
-            used |= self._names_in(self.equations[state.name])
+            used |= self.names_in(self.equations[state.name])
         for output, expression in zip(self.outputs, self.observations, strict=True):
-            there = self._names_in(expression)
+            there = self.names_in(expression)
             used |= there
             if not there & set(self.names_of_states):
                 raise InputError(
@@ -312,7 +312,7 @@ class Motion(NotebookView):
                     f"the parameter '{name}' is in no equation and no output; use or remove it."
                 )
 
-    def _names_in(self, *expressions: Expression) -> set[str]:
+    def names_in(self, *expressions: Expression) -> set[str]:
         """Return the names of expressions, and those of the definitions that they use."""
         found = {name for expression in expressions for name in expression.names}
         for name, given in reversed(self.definitions):  # each after those that it uses
@@ -322,12 +322,12 @@ class Motion(NotebookView):
 
     def parameters_in(self, state: str) -> tuple[str, ...]:
         """Return the parameters in a state's equation, for a motion with expressions."""
-        there = self._names_in(self.equations[state])
+        there = self.names_in(self.equations[state])
         return tuple(name for name in self.names if name in there)
 
     def parameters_of_output(self, i: int) -> tuple[str, ...]:
         """Return the parameters in output i's expression, for a motion with expressions."""
-        there = self._names_in(self.observations[i])
+        there = self.names_in(self.observations[i])
         return tuple(name for name in self.names if name in there)
 
     @property
@@ -542,7 +542,7 @@ class Motion(NotebookView):
     @cached_property
     def _read(self) -> tuple[set[str], set[str]]:
         """Return what the equations need of the names, and what the outputs do."""
-        return self._names_in(*self.equations.values()), self._names_in(*self.observations)
+        return self.names_in(*self.equations.values()), self.names_in(*self.observations)
 
     def values(
         self, x: Any, u: Any, p: Any, xp: Any, needed: Collection[str] | None = None
