@@ -122,7 +122,7 @@ def test_data_width_is_the_median_of_what_moves():
         ({"kind": "offset", "on": "v[k-1]"}, r"an offset .* takes no `on`; got 'v\[k-1\]'"),
         (
             {"kind": "stribeck", "on": "v[k-1]"},
-            r"stribeck needs `width`, in the unit of v\[k-1\]; data_width suggests",
+            r"stribeck needs `width`, in the unit of v\[k-1\]. Usual is the median",
         ),
         ({"kind": "cubic", "on": "v[k-1]", "width": 1.0}, "kind cubic takes no `width`; got 1.0"),
         (
