@@ -387,15 +387,17 @@ class EstimatedStates:
             return found.T[: len(chosen)], misfit[: len(chosen)]
 
         settled, misfit = states.copy(), np.empty(len(begins))
-        usual = np.empty_like(misfit)
+        again: list[Vector] = []
         for chosen in _batches(np.arange(len(begins))):
-            settled[chosen], misfit[chosen] = settle_from(states, chosen)
-            usual[chosen] = np.median(misfit[chosen])
-        # A derivative of a noisy output can be so wrong that the run from it leaves
-        for chosen in _batches(np.flatnonzero(misfit > _LOST * usual)):
-            again, other = settle_from(free, chosen)
+            settled[chosen], own = settle_from(states, chosen)
+            misfit[chosen], usual = own, np.median(own)
+            # A derivative of a noisy output can be so wrong that the run from it leaves. Where one
+            # does, others end beside the best start, too
+            again += [chosen[own > usual]] if (own > _LOST * usual).any() else []
+        for chosen in _batches(np.concatenate(again)) if again else ():
+            found, other = settle_from(free, chosen)
             better = other < misfit[chosen]
-            settled[chosen[better]] = again[better]
+            settled[chosen[better]] = found[better]
         pieces = []
         for chosen in _batches(np.arange(len(begins))):
             following = np.moveaxis(inputs[along(chosen, _SIDE_BY_SIDE)], -1, 1)
