@@ -546,7 +546,7 @@ def reopen_estimate(model: Model[MotionDynamics], record: Record) -> MotionEstim
     segmented = segmented.with_substeps(form.substeps)
     segmented = replace(
         segmented,
-        scaling=model.reached,
+        scaling=model.scaling,
         unit=np.asarray(numbers.gain),
     )
     states, slope = (_pad_segments(part, segmented) for part in (kept.states, kept.slope))

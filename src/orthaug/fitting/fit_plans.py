@@ -530,7 +530,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
             f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
         )
     problem = problem.for_linear_learner() if model.form.features.linear else problem
-    task = OneStepTask.of(problem, bound.learner, model.reached, np.asarray(numbers.gain), engine)
+    task = OneStepTask.of(problem, bound.learner, model.scaling, np.asarray(numbers.gain), engine)
     return task, model.theta - model.theta_aux
 
 

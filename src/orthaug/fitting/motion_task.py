@@ -608,7 +608,7 @@ class WarmMotionTask(MotionTask):
         """
         form, numbers = model.form, model.numbers
         plan = SegmentedMotion.of(problem, form.bound, criterion, sums=SegmentSums.of(engine))
-        plan = replace(plan, scaling=model.reached, unit=np.asarray(numbers.gain))
+        plan = replace(plan, scaling=model.scaling, unit=np.asarray(numbers.gain))
         coordinates = problem.motion.coordinates
         beside = form.coordinates.physical(model.theta - model.theta_aux)
         return cls(plan, begun=np.clip(coordinates.of(beside), *coordinates.bounds))

@@ -72,9 +72,14 @@ class RecordModel(Generic[Form]):
         )[0]
 
     @property
+    def scaling(self) -> Scaling:
+        """Scaling of the learner's features, which is part of the learner."""
+        return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
+
+    @property
     def reached(self) -> Scaling:
         """Range of the learner's features in training."""
-        return Scaling(np.asarray(self.numbers.centre), np.asarray(self.numbers.halfwidth))
+        return self.scaling
 
     def beyond(self, features: Matrix) -> Bool[np.ndarray, "N"]:
         """Return where a feature of the learner (N, nz) is outside its range in training."""
