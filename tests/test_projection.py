@@ -181,3 +181,8 @@ def test_directions_that_differ_in_what_no_row_tells_are_one():
     found = projection.without_null(basis)
     assert found.shape == (3, 1) and np.linalg.matrix_rank(phi[:, 0] @ found) == 1
     assert np.array_equal(projection.without_null(basis[:, :1]), basis[:, :1])
+
+
+def test_no_rows_have_rank_0():
+    none = Projection.factor(np.zeros((0, 1, 2)))
+    assert none.r.shape == (0, 2) and none.q.shape == (0, 1, 0)

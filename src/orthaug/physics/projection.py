@@ -41,7 +41,7 @@ class Projection:
         q, r = scipy.linalg.qr(  # pyright: ignore[reportAssignmentType]  (its stubs do not know `mode`)
             stacked * scale, mode="economic", overwrite_a=True, check_finite=False
         )
-        return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, -1))
+        return cls(r, scale, phi, np.ascontiguousarray(q).reshape(rows, ny, len(r)))
 
     @property
     def to_coordinates(self) -> Matrix:
