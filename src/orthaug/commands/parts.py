@@ -400,8 +400,8 @@ def _other_step(
             continue
         header = clock.column.header
         remedy = f'time = "{header}"' if clock.instants else f"sampling_time = {clock.step:g}"
-        if clock.uneven:
-            shortest, longest = clock.uneven
+        if (uneven := clock.uneven) is not None:
+            shortest, longest = uneven
             found = (
                 f"the steps of column '{header}' of {file} are {shortest:.3g} to {longest:.3g} s. "
                 "Its rows are taken as evenly spaced"

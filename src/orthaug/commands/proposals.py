@@ -503,7 +503,7 @@ def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
         record = job.train.record
         if is_stepped(record):  # another one would only fit better by chance
             holds = tuple(hold for hold in holds if hold == "zero-order")
-        elif len(holds) > 1:
+        else:
             holds = sort_holds(record, holds)
     for hold in holds:
         yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})

@@ -70,7 +70,7 @@ def sample_slopes(
     The stages are run first; then the slopes of where the sample ends go back through them, with
     one pass through the learner for each state, and never one for each weight.
     """
-    halves, nu, _learned = 2 * form.substeps, len(form.motion.inputs), form.corrected[0]
+    halves, nu = 2 * form.substeps, len(form.motion.inputs)
 
     def at_points(row: Array) -> tuple[Array, Any]:
         row, pace = form.split_pace(row)

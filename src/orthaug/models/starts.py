@@ -367,28 +367,25 @@ class EstimatedStates:
         loose = np.where(known, self.loose * _KNOWN, self.loose)
         length = padded_steps(steps)  # few horizons have programs of their own
 
-        def along(chosen: Vector, lanes: int) -> Vector:
-            """Return the rows (T, m) of windows; some are there twice, so that few m occur."""
-            chosen = np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
-            found = begins[chosen][None, :] + np.arange(length)[:, None]
-            return np.minimum(found, len(inputs) - 1)
+        def along(lanes: Vector) -> Vector:
+            """Return the rows (T, m) of windows."""
+            return np.minimum(begins[lanes] + np.arange(length)[:, None], len(inputs) - 1)
 
         def settle_from(guesses: Matrix, chosen: Vector) -> tuple[Matrix, Vector]:
-            own = along(chosen, MOST_LANES)[:window]
+            lanes = _fill(chosen, MOST_LANES)
+            own, begin = along(lanes)[:window], guesses[lanes].T
             windows = Windows(
                 np.moveaxis(inputs[own], -1, 1),
                 np.moveaxis(experiment.outputs[own], -1, 1),
                 np.ones(own.shape, dtype=bool),
             )
-            begin = np.pad(
-                guesses[chosen].T, ((0, 0), (0, own.shape[1] - len(chosen))), mode="edge"
-            )
             found, misfit = settle(form, numbers, begin, windows, model.weight, loose, *_UNTIL)
             return found.T[: len(chosen)], misfit[: len(chosen)]
 
+        every = np.arange(len(begins))
         settled, misfit = states.copy(), np.empty(len(begins))
         again: list[Vector] = []
-        for chosen in _batches(np.arange(len(begins))):
+        for chosen in _batches(every):
             settled[chosen], own = settle_from(states, chosen)
             misfit[chosen], usual = own, np.median(own)
             # A derivative of a noisy output can be so wrong that the run from it leaves. Where one
@@ -399,10 +396,9 @@ class EstimatedStates:
             better = other < misfit[chosen]
             settled[chosen[better]] = found[better]
         pieces = []
-        for chosen in _batches(np.arange(len(begins))):
-            following = np.moveaxis(inputs[along(chosen, _SIDE_BY_SIDE)], -1, 1)
-            more = following.shape[2] - len(chosen)
-            begin = np.pad(settled[chosen].T, ((0, 0), (0, more)), mode="edge")
+        for chosen in _batches(every):
+            lanes = _fill(chosen, _SIDE_BY_SIDE)
+            following, begin = np.moveaxis(inputs[along(lanes)], -1, 1), settled[lanes].T
             outputs = [last_outputs(*end, begin, following, steps).total for end in ends]
             pieces.append([np.asarray(own).T[: len(chosen)] for own in outputs])
         return [np.concatenate(piece) for piece in zip(*pieces, strict=True)]
@@ -497,6 +493,11 @@ class EstimatedStates:
             )
         points = np.concatenate(pieces)
         return points[np.isfinite(points).all(axis=1)]
+
+
+def _fill(chosen: Vector, lanes: int) -> Vector:
+    """Return the choice with its last one repeated to a multiple of `lanes`: few shapes occur."""
+    return np.pad(chosen, (0, -len(chosen) % lanes), mode="edge")
 
 
 def _batches(rows: Vector) -> Iterator[Vector]:
