@@ -25,7 +25,7 @@ import pytest
 from test_cli import run, signals, write_csv
 
 from orthaug import InputError, load_spec
-from orthaug._base.progress import Stage
+from orthaug._base.progress import ReachedStage, Stage
 from orthaug.commands import demo
 from orthaug.commands.app import spec_text, worker
 from orthaug.commands.app.gate import Gate
@@ -385,14 +385,18 @@ def test_lines_of_progress_say_what_each_run_is(csv, tmp_path, monkeypatch, caps
 def test_lines_of_progress_name_the_stages_after_the_runs(monkeypatch, capsys):
     monkeypatch.setenv("ORTHAUG_PROGRESS", "json")
     with training_bar(1, 10):
+        Stage.CHOICE.enter("run 2 of 5 on held-out blocks")
         Stage.SCORES.enter()
     Stage.REPORT.enter()  # the result is written after the bar has ended
     lines = capsys.readouterr().err.splitlines()
     stages = [json.loads(line)["stage"] for line in lines if line.startswith("{")]
-    assert stages == ["scores", "report"]
-    assert Stage.SCORES.after(None) is Stage.SCORES
-    assert Stage.ADVICE.after(Stage.SCORES) is Stage.ADVICE
-    assert Stage.SCORES.after(Stage.ADVICE) is Stage.ADVICE  # of a trial
+    choice = "choosing between the runs: run 2 of 5 on held-out blocks"
+    assert stages == [choice, "scores", "report"]
+    reached = ReachedStage.of(choice, None)
+    assert reached == (Stage.CHOICE, choice)
+    reached = ReachedStage.of("trials of advice", reached)
+    assert reached == (Stage.ADVICE, "trials of advice")
+    assert ReachedStage.of(choice, reached) is reached  # of a trial
 
 
 def test_an_early_end_names_the_stage_after_the_runs():

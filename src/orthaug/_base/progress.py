@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 LOG = logging.getLogger("orthaug")
 LOG.addHandler(logging.NullHandler())
@@ -28,17 +28,28 @@ class Stage(StrEnum):
     FIGURES = "figures"
     REPORT = "report"
 
-    def after(self, reached: Stage | None) -> Stage:
-        """Return this stage, or the one that was reached if that is later.
+    def enter(self, part: str = "") -> None:
+        """Log that a fit has come to this stage, or to a part of it."""
+        _STAGE_LOG.info("%s", f"{self.value}: {part}" if part else self.value)
+
+
+class ReachedStage(NamedTuple):
+    """How far a fit is after its runs."""
+
+    stage: Stage
+    text: str
+    """The stage in words, with its part."""
+
+    @classmethod
+    def of(cls, text: str, before: ReachedStage | None) -> ReachedStage:
+        """Return what a logged text says, or what was reached before if that is later.
 
         A trial of advice comes to earlier stages again, which are part of it.
         """
-        order = list(Stage)
-        return self if reached is None or order.index(self) > order.index(reached) else reached
-
-    def enter(self) -> None:
-        """Log that a fit has come to this stage."""
-        _STAGE_LOG.info("%s", self.value)
+        order, stage = list(Stage), Stage(text.partition(": ")[0])
+        if before is not None and order.index(stage) < order.index(before.stage):
+            return before
+        return cls(stage, text)
 
 
 _STAGE_LOG, _MODEL_LOG = LOG.getChild("stage"), LOG.getChild("model")

@@ -17,7 +17,7 @@ from orthaug._base.checks import Vector
 from orthaug._base.errors import InputError
 from orthaug._base.lines import first_words, join_words, plural
 from orthaug._base.parallel import iterate_results, run_all
-from orthaug._base.progress import LOG
+from orthaug._base.progress import LOG, Stage
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.proposals import (
@@ -163,6 +163,7 @@ class Trials:
 
     def of(self, proposal: Proposal) -> ProposalErrors:
         """Return the trial of a proposal."""
+        Stage.ADVICE.enter(proposal.words)
         try:
             job = changed_job(self.job, self.settled | proposal.change)
         except (InputError, ValueError) as error:

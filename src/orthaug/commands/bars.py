@@ -20,7 +20,7 @@ from orthaug._base.progress import (
     Plan,
     Progress,
     ProgressCallback,
-    Stage,
+    ReachedStage,
     StopTraining,
     follow_training,
     stop_following,
@@ -96,7 +96,7 @@ def training_bar(
     ):
         task = bar.add_task("compiling", total=runs * iterations)
         done: dict[int, int] = {}
-        stage: Stage | None = None
+        stage: ReachedStage | None = None
 
         def show(run: int, iteration: int, loss: float) -> None:
             nonlocal reached
@@ -115,11 +115,11 @@ def training_bar(
             if ENOUGH.is_set():
                 raise StopTraining
 
-        def enter(name: str) -> None:
+        def enter(text: str) -> None:
             nonlocal reached, stage
-            line.enter(name)
-            stage = Stage(name).after(stage)
-            reached = stage.value
+            line.enter(text)
+            stage = ReachedStage.of(text, stage)
+            reached = stage.text
             bar.update(task, description=reached, total=None)
 
         follow_training(enter, _tell_model if line.wanted else None)

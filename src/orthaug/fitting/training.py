@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -420,7 +421,13 @@ def _held_out(
     LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(made))
     taken, task = max(run.iterations for run in runs), task.after(runs)
     given = (task, [(starts[i], ridges[i]) for i in made], structure, solver, taken)
-    found = runner.map(_on_fold, given, folds.pairs)
+    begun, planned = itertools.count(1), len(folds.pairs) * len(made)
+    found = runner.map(
+        _on_fold,
+        given,
+        folds.pairs,
+        lambda _: Stage.CHOICE.enter(f"run {next(begun)} of {planned} on held-out blocks"),
+    )
     alone, *of_made = (
         [p for block in column for p in block] for column in zip(*found, strict=True)
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from orthaug._base.errors import InputError
-from orthaug._base.progress import Stage
+from orthaug._base.progress import ReachedStage
 from orthaug.commands.bars import ENOUGH_LINE, PROGRESS_VARIABLE
 
 _LONGEST = 2**26  # bytes of a line of an answer
@@ -47,7 +47,7 @@ class Command:
     """The last progress: `run`, `runs`, `iteration`, `loss`, `done` (share)."""
     losses: list[tuple[Run, int, float | None]] = field(default_factory=list)
     """(run, iteration, loss) of each line of progress."""
-    stage: Stage | None = None
+    stage: ReachedStage | None = None
     """The stage after the runs that it has come to."""
     models: dict[str, dict[str, Any]] = field(default_factory=dict)
     """By name, the free run of physics alone and of the best run so far: `time`, `outputs`."""
@@ -117,7 +117,7 @@ class Command:
             if message is None:
                 self.lines = [*self.lines, line][-_LINES:]
             elif "stage" in message:
-                self.stage = Stage(message["stage"]).after(self.stage)
+                self.stage = ReachedStage.of(message["stage"], self.stage)
             elif "model" in message:
                 if self.stage is None:  # else it is of a trial
                     self.models.pop(message["model"], None)

@@ -192,9 +192,9 @@ class TrainingView:
                 now += f", loss {number(progress['loss'], 4)}"
             done = progress.get("done", 0)
             if command.stage is not None:
-                step, steps = list(Stage).index(command.stage) + 1, len(Stage)
+                step, steps = list(Stage).index(command.stage.stage) + 1, len(Stage)
                 now, done = (
-                    f"after the runs, {step} of {steps}: {command.stage.value}",
+                    f"after the runs, {step} of {steps}: {command.stage.text}",
                     step / steps,
                 )
             if command.stopping or command.ending:
