@@ -29,7 +29,14 @@ from orthaug.commands.proposals import (
 )
 from orthaug.data.preparation import prepare
 from orthaug.data.record import Record
-from orthaug.fitting.held_out import Pieces, Ratio, held_out_blocks, mean_square, squared_errors
+from orthaug.fitting.held_out import (
+    WORTH,
+    Pieces,
+    Ratio,
+    held_out_blocks,
+    mean_square,
+    squared_errors,
+)
 from orthaug.reports.page_verdict import is_biased_by_feedback
 from orthaug.reports.result import FitResult
 
@@ -309,7 +316,7 @@ def _conclude_trials(
     before = math.sqrt(mean_square(base))
     helps = [one for one in tried if _helps(one, base)]
     better: list[ProposalErrors] = []
-    for one in sorted(helps, key=_rank):
+    for one in _in_order(helps):
         if not any(math.isclose(one.error, other.error, rel_tol=_SAME) for other in better):
             better.append(one)
     advice = [
@@ -387,10 +394,24 @@ def _helps(one: ProposalErrors, base: Pieces) -> bool:
     return one.proposal.ahead is not None or _ratio(one, own).code == "helps"
 
 
-def _rank(one: ProposalErrors) -> float:
-    """Return the error by which changes that help are in order."""
-    adds_nothing = one.proposal.step is not None or one.proposal.replaces
-    return one.error * (_ALIKE if adds_nothing else 1.0)
+def _in_order(helps: Sequence[ProposalErrors]) -> list[ProposalErrors]:
+    """Return the changes that help, the best first.
+
+    Where others are hardly worse, one that adds nothing to the model leads, and then the one that
+    was proposed first: proposals are in the order of what the residual shows.
+    """
+    errors = [one.error * (_ALIKE if _adds_nothing(one) else 1.0) for one in helps]
+    enough = (1 + WORTH) * min(errors, default=0.0)
+    ranks = [
+        (max(error, enough), not _adds_nothing(one))
+        for one, error in zip(helps, errors, strict=True)
+    ]
+    return [helps[i] for i in sorted(range(len(helps)), key=ranks.__getitem__)]
+
+
+def _adds_nothing(one: ProposalErrors) -> bool:
+    """Return whether a change makes the model no larger."""
+    return one.proposal.step is not None or one.proposal.replaces
 
 
 def _ratio(one: ProposalErrors, base: Pieces) -> Ratio:
