@@ -852,7 +852,7 @@ BAD = {
     "suspect": (
         "[training]",
         '[[suspects]]\nkind = "cubic"\non = "w"\n[training]',
-        "suspect 'cubic(w)' = (w)**3: unknown name 'w'",
+        "suspect 'cubic(w)' = w**3: unknown name 'w'",
     ),
     "suspect's output": (
         "[training]",

@@ -9,7 +9,6 @@ physics.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -24,6 +23,7 @@ from orthaug.analysis.suspects import (
     WIDTHS,
     MotionSuspect,
     Suspect,
+    as_operand,
     changes_sign,
     evaluate_rows,
     is_level,
@@ -46,7 +46,6 @@ _WIDTHS = (0.06, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)  # in median sizes of what a t
 _SOFT = _WIDTHS[1:]  # of friction that turns round smoothly
 _KINKS = (0.25, 0.5, 1.0, 1.5, 2.0)  # the same: beyond these hardly a row is on the other side
 _POWERS = (0.3, 0.4, 0.5, 0.65, 0.8, 1.2, 1.5, 2.0, 2.5, 3.0)
-_WHOLE = re.compile(r"\w+(\[[^\]]*\])?")  # needs no brackets: a name, or a lag of one
 _MOST_ARGUMENTS = 8  # expressions that the families are tried on
 
 
@@ -69,9 +68,7 @@ class Family(NamedTuple):
     def expression(self, on: str, width: str, *, level: bool = False) -> str:
         """Return the member of a width, or power, that acts on an expression."""
         text = self.level if level and self.level else self.text
-        if _WHOLE.fullmatch(on):
-            return text(on, width)
-        return text(f"({on})", width).replace(f"(({on}))", f"({on})")
+        return text(as_operand(on), width).replace(f"(({on}))", f"({on})")
 
 
 def _odd_power(x: str, power: str) -> str:

@@ -8,6 +8,7 @@ as -1/m its coefficient is a force in N though the equation is one of m/s².
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -46,19 +47,26 @@ class _Kind(NamedTuple):
     memory: bool = False
 
 
+_WHOLE = re.compile(r"\w+(\[[^\]]*\])?")  # a name, or a lag of one
+
+
+def as_operand(expression: str) -> str:
+    """Return an expression as an operator takes it, in brackets where it needs them."""
+    return expression if _WHOLE.fullmatch(expression) else f"({expression})"
+
+
 def _clip(x: str, w: str) -> str:
     return f"max(min({x}, {w}), -{w})"
 
 
-# (x) is in parentheses wherever an operator touches it
 _KINDS = {
     "coulomb": _Kind(lambda x, w: f"sign({x})"),
     "stribeck": _Kind(lambda x, w: f"sign({x})*exp(-abs({x})/{w})", width=True),
-    "stribeck_gauss": _Kind(lambda x, w: f"sign({x})*exp(-(({x})/{w})**2)", width=True),
-    "quadratic_drag": _Kind(lambda x, w: f"({x})*abs({x})"),
-    "cubic": _Kind(lambda x, w: f"({x})**3"),
+    "stribeck_gauss": _Kind(lambda x, w: f"sign({x})*exp(-({as_operand(x)}/{w})**2)", width=True),
+    "quadratic_drag": _Kind(lambda x, w: f"{as_operand(x)}*abs({x})"),
+    "cubic": _Kind(lambda x, w: f"{as_operand(x)}**3"),
     "square_root": _Kind(lambda x, w: f"sign({x})*sqrt(abs({x}))"),
-    "dead_zone": _Kind(lambda x, w: f"({x}) - {_clip(x, w)}", width=True),
+    "dead_zone": _Kind(lambda x, w: f"{as_operand(x)} - {_clip(x, w)}", width=True),
     "saturation": _Kind(_clip, width=True),
     "offset": _Kind(lambda x, w: "1"),
     "expression": _Kind(lambda x, w: x),
