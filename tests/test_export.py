@@ -484,6 +484,54 @@ def test_a_motion_runs_for_ten_thousand_steps_elsewhere(tmp_path, name, target):
     near(free, given.free, 1e-9)
 
 
+ARM = ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm")
+CORTEX_M4 = (
+    *("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror"),
+    *("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-DPLANT_FLOAT"),
+)
+NS_PER_TICK = 40  # of the board's timer; the emulated processor takes 1 ns for an instruction
+
+
+@pytest.mark.proof
+@pytest.mark.skipif(not all(map(shutil.which, ARM)), reason=f"needs {', '.join(ARM)}")
+@pytest.mark.parametrize("name", ["network", "motion, first-order hold"])
+def test_single_precision_runs_on_a_cortex_m4(tmp_path, name, record_property):
+    """The emulator counts instructions; most of a Cortex-M4 take one cycle, memory and branches more."""
+    oa.export(MODELS[name](), tmp_path / "plant", "c", name="plant")
+    board = Path(__file__).parent / "fixtures" / "cortex_m4"
+
+    def run_of(*sources: object) -> str:
+        arm, _, emulator = ARM
+        made = [arm, *CORTEX_M4, "-I.", board / "startup.c", "plant.c", *sources]
+        linked = ["-T", board / "board.ld", "--specs=rdimon.specs", "-lm", "-o", "plant.elf"]
+        subprocess.run([*made, *linked], cwd=tmp_path / "plant", check=True)
+        machine = ["-M", "mps2-an386", "-nographic", "-icount", "shift=0"]
+        output = ["-semihosting-config", "enable=on,target=native", "-kernel", "plant.elf"]
+        done = subprocess.run(
+            [emulator, *machine, *output],
+            **{"cwd": tmp_path / "plant", "check": True, "timeout": 60},
+            **{"capture_output": True, "text": True},
+        )
+        return done.stdout
+
+    checked = re.fullmatch(
+        r"64 steps: largest difference (\S+), largest output (\S+), 0 flagged\s*",
+        run_of("check.c"),
+    )
+    assert checked and float(checked[1]) < 1e-5 * float(checked[2])
+    timed = re.fullmatch(r"(\d+) ticks for 1000 steps, flag 0\s*", run_of(board / "timed.c"))
+    assert timed
+    compiled = [ARM[0], *CORTEX_M4, "-c", "plant.c"]
+    subprocess.run(compiled, cwd=tmp_path / "plant", check=True)
+    sizes = subprocess.run(
+        [ARM[1], "plant.o"], cwd=tmp_path / "plant", check=True, capture_output=True, text=True
+    )
+    text, data, bss = map(int, sizes.stdout.splitlines()[1].split()[:3])
+    assert text < 4096 and data == bss == 0
+    record_property("bytes of code and constants", text)
+    record_property("instructions of a step", int(timed[1]) * NS_PER_TICK // 1000)
+
+
 @pytest.mark.proof
 def test_python_control_linearizes_the_model_as_it_does_itself(tmp_path):
     control = pytest.importorskip("control")
