@@ -15,9 +15,10 @@ def _a_ridge(monkeypatch):
     monkeypatch.setattr(silence, "evidence_ridge", lambda objective, point, effective: 0.123456)
 
 
-def _run(effective, ending=Ending.CONVERGED):
+def _run(effective, ending=Ending.CONVERGED, iterations=10):
+    end = SimpleNamespace(point=None)
     return SimpleNamespace(
-        effective=effective, ending=ending, objective=None, end=SimpleNamespace(point=None)
+        effective=effective, ending=ending, objective=None, end=end, iterations=iterations
     )
 
 
@@ -42,6 +43,14 @@ def test_a_learner_that_lives_on_all_rows_has_a_ridge_for_its_folds():
 def test_no_other_has_one(regularization, run):
     """Neither what is no evidence, nor what is silent on all rows: there `add_retries` has weaker ones."""
     assert silence.fold_ridges([_start(regularization)], [run], 2) == [None]
+
+
+def test_runs_that_left_the_same_are_made_on_blocks_once():
+    runs = [_run(3.0, iterations=124), _run(3.01, iterations=33), _run(3.0), _run(9.0), _run(3.0)]
+    runs += [_run(0.4), _run(0.9, iterations=2), _run(np.nan), _run(3.0, Ending.NON_FINITE)]
+    starts = [_start("evidence")] * 4 + [_start("none")] + [_start("evidence")] * 4
+    losses = [0.0468295, 0.0468293, 0.0336, 0.0468294, 0.0468294, 0.06, 0.061, 0.0468, 0.0468295]
+    assert silence.stand_ins(starts, runs, losses, 1) == [1, 1, 2, 3, 4, 6, 6, 7, 8]
 
 
 def self_excited(seed: int) -> oa.Record:

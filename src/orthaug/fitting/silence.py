@@ -9,6 +9,7 @@ ahead, where "auto" has compared it already.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,6 +25,8 @@ from orthaug.fitting.status import Ending
 _SILENT = 0.5  # effective weights: fewer do nothing
 _CONSTANT = 1.5  # effective weights for each output of the learner: one is a constant
 _LOOK = 100  # iterations that show whether a learner without regularization explains more
+# Relative: runs that end so close to each other left the same
+_SAME_LOSS, _SAME_WEIGHTS = 1e-4, 0.02
 _FLAT = 0.01  # of the learner's RMS: a smaller standard deviation is that of a constant
 
 
@@ -83,20 +86,38 @@ def _chance(run: Any) -> float:
     return float(explained / max(count * share, 1.0))
 
 
-def first_alike(starts: Sequence[PlannedRun], runs: Sequence[Any], outputs: int) -> list[int]:
-    """Return for each run the first that left the same: evidence that silenced the learner.
+def stand_ins(
+    starts: Sequence[PlannedRun],
+    runs: Sequence[FinishedRun],
+    losses: Sequence[float],
+    outputs: int,
+) -> list[int]:
+    """Return for each run the one that is made on held-out blocks in its place.
+
+    Runs that evidence silenced left the same, and so did those of one regularization that ended
+    with one loss and as many effective weights. Of these the one of the fewest iterations, which
+    its start leads to most directly, is enough.
 
     Args:
         starts, runs: planned runs and how they ended.
+        losses: of the runs.
         outputs: of the learner.
     """
-    silenced = [
-        start.regularization == "evidence"
-        and run.ending.usable
-        and is_silenced(run.effective, outputs)
-        for start, run in zip(starts, runs, strict=True)
-    ]
-    return [silenced.index(True) if silent else i for i, silent in enumerate(silenced)]
+
+    def are_alike(i: int, j: int) -> bool:
+        one, other = runs[i], runs[j]
+        if i == j or starts[i].regularization != starts[j].regularization:
+            return i == j
+        if not (one.ending.usable and other.ending.usable):
+            return False
+        if starts[i].regularization == "evidence" and is_silenced(one.effective, outputs):
+            return is_silenced(other.effective, outputs)
+        return math.isclose(losses[i], losses[j], rel_tol=_SAME_LOSS) and math.isclose(
+            one.effective, other.effective, rel_tol=_SAME_WEIGHTS
+        )
+
+    alike = [[j for j in range(len(runs)) if are_alike(i, j)] for i in range(len(runs))]
+    return [min(group, key=lambda j: runs[j].iterations) for group in alike]
 
 
 def found_ridge(run: Any) -> float:

@@ -33,10 +33,10 @@ from orthaug.fitting.one_step import OneStepTask
 from orthaug.fitting.setup import FOLD_ITERATIONS
 from orthaug.fitting.silence import (
     add_retries,
-    first_alike,
     fold_ridges,
     is_silenced,
     retry_warnings,
+    stand_ins,
 )
 from orthaug.fitting.status import Ending
 from orthaug.fitting.structures import Orthogonal, Structure
@@ -416,7 +416,7 @@ def _held_out(
         )
         return None
     ridges = fold_ridges(starts, runs, task.bound.ny) if choice.retry else [None] * len(starts)
-    like = first_alike(starts, runs, task.bound.ny)
+    like = stand_ins(starts, runs, [task.loss(run) for run in runs], task.bound.ny)
     made = list(dict.fromkeys(like))
     LOG.info("cross-validation: %d folds of %d runs", len(folds.pairs), len(made))
     taken, task = max(run.iterations for run in runs), task.after(runs)
