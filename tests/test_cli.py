@@ -867,6 +867,13 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
         {"steps.csv": "u,y\n1,2\n1,3\n"},
         ["steps.csv", "data.tests.steps", "2 rows, too few"],
     ),
+    "test part of one row": (
+        {
+            "steps.csv": "u,y\n1,2\n",
+            "": ("skip = 5", "rows = [0, 1]"),
+        },
+        ["steps.csv", "has 1 row, too few; "],
+    ),
     "skip longer than the part": (
         {"": ("skip = 5", "skip = 60")},
         ["steps.csv", "60 rows, too few", "first 60"],
