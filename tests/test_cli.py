@@ -827,7 +827,7 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     ),
     "lags for other channels": (
         {"": ('kind = "none"', "[lags]\nna = [1, 1]")},
-        ["`na` has 2 numbers", "1 outputs"],
+        ["`na` has 2 numbers for 1 output;"],
     ),
     "unknown key": (
         {"": ("skip = 5", "skipp = 5")},
