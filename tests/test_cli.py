@@ -827,7 +827,7 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     ),
     "lags for other channels": (
         {"": ('kind = "none"', "[lags]\nna = [1, 1]")},
-        ["`na` has 2 numbers", "1 outputs"],
+        ["`na` has 2 numbers for 1 output;"],
     ),
     "unknown key": (
         {"": ("skip = 5", "skipp = 5")},
@@ -866,6 +866,13 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
     "test part too short": (
         {"steps.csv": "u,y\n1,2\n1,3\n"},
         ["steps.csv", "data.tests.steps", "2 rows, too few"],
+    ),
+    "test part of one row": (
+        {
+            "steps.csv": "u,y\n1,2\n",
+            "": ("skip = 5", "rows = [0, 1]"),
+        },
+        ["steps.csv", "has 1 row, too few; "],
     ),
     "skip longer than the part": (
         {"": ("skip = 5", "skip = 60")},

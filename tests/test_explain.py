@@ -468,7 +468,9 @@ def test_explain_leaves_out_missing_cells_or_refuses_them(project, tmp_path):
 @pytest.mark.usefixtures("without_figures")
 def test_wrong_use_is_told_in_a_line(project):
     refused = run("explain", project / "alone", project / "run.csv")
-    assert refused.code == 2 and one_line(refused.err, "physics alone")
+    assert refused.code == 2 and one_line(
+        refused.err, f"{project / 'alone'}: the model is physics alone"
+    )
     write_csv(project / "inputs.csv", u=np.zeros(50))
     assert one_line(
         run("explain", project / "plant", project / "inputs.csv").err, "the data have no y"

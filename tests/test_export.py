@@ -532,6 +532,14 @@ def test_single_precision_runs_on_a_cortex_m4(tmp_path, name, record_property):
     record_property("instructions of a step", int(timed[1]) * NS_PER_TICK // 1000)
 
 
+def test_code_computes_nothing_that_it_does_not_read(tmp_path):
+    model = limited(lagged(LINEAR[:1], ("y[k-1]", "w[k-1]"), oa.MLP((2,)), ("y",), ("w",)))
+    oa.export(model, tmp_path / "c", "c", name="plant")
+    text = (tmp_path / "c/plant.c").read_text()
+    named = re.findall(r"const real (h_\w+) =", text)
+    assert named and all(len(re.findall(rf"\b{name}\b", text)) > 1 for name in named)
+
+
 @pytest.mark.proof
 def test_python_control_linearizes_the_model_as_it_does_itself(tmp_path):
     control = pytest.importorskip("control")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
+import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -326,3 +329,23 @@ def test_refusing_does_not_warn_besides(text):
 def test_text_that_is_not_text():
     with pytest.raises(InputError, match="1"):
         parse(1)
+
+
+def test_threads_parse_while_the_garbage_collector_lets_others_run():
+    def switch(phase, info):
+        time.sleep(0)
+
+    def nested(depth):
+        if depth:
+            return nested(depth - 1)
+        return {str(parse(f"(y[k-1] + {i}*u[k])/(2 + sin(u[k-3]))**2")) for i in range(1000)}
+
+    threshold = gc.get_threshold()
+    gc.set_threshold(50)
+    gc.callbacks.append(switch)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            assert [len(texts) for texts in pool.map(nested, (0, 9))] == [1000, 1000]
+    finally:
+        gc.callbacks.remove(switch)
+        gc.set_threshold(*threshold)

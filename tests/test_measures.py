@@ -93,9 +93,12 @@ def test_weighted_scales_its_weights():
     [
         (np.ones(3), r"there are \(3,\) weights for 400 usable rows; give one for each"),
         (np.ones((400, 1)), r"there are \(400, 1\) weights for 400 usable rows"),
-        (np.full(400, -1.0), "finite, none negative, and not all zero"),
-        (np.zeros(400), "finite, none negative, and not all zero"),
-        (np.full(400, np.nan), "finite, none negative, and not all zero"),
+        (
+            np.where(np.arange(400) == 3, -1.5, 1.0),
+            "weight 3 of the usable rows, counted from 0, is -1.5; expected a finite number, 0 or",
+        ),
+        (np.zeros(400), "the weights of the usable rows are all 0; expected one above"),
+        (np.full(400, np.nan), "weight 0 of the usable rows, counted from 0, is nan; expected a"),
         (["a"] * 400, "the weights must be numbers"),
     ],
 )
@@ -145,7 +148,7 @@ def test_lag_zero_may_be_written_out():
             r"column u\[k-1\] holds a value that is not finite",
         ),
         ({"u[k-1]": [1.0], "y[k-1]": [1.0]}, [1.0, 2.0], r"there are \(2,\) weights for 1 samples"),
-        ({"u[k-1]": [1.0, 2.0], "y[k-1]": [1.0, 2.0]}, [2.0, -1.0], "none negative"),
+        ({"u[k-1]": [1.0, 2.0], "y[k-1]": [1.0, 2.0]}, [2.0, -1.0], "counted from 0, is -1"),
         ({"u[k-1]": ["a"], "y[k-1]": [1.0]}, None, r"column u\[k-1\]"),
         ({"u[k-1]": [1.0], "u[ k-1]": [2.0], "y[k-1]": [1.0]}, None, r"u\[k-1\].* twice"),
     ],

@@ -432,7 +432,11 @@ def test_horizon_longer_than_the_record(first_order):
     ("initial", "message"),
     [
         (np.zeros((4, 3)), "`initial` has 3 columns; expected one per output, 2"),
-        (np.zeros((1, 2)), "`initial` has 1 rows; expected the first 4 outputs of the record"),
+        (
+            np.zeros((1, 2)),
+            "`initial` has 1 row; expected the outputs of the 4 rows before the first usable one, "
+            "or of at least the last 2 of them",
+        ),
         ([[np.nan, 0.0]] * 4, "`initial` is not finite at row 0, channel 0"),
         ("mesured", "`initial` must be 'measured', 'zero' or an array"),
     ],

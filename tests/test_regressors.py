@@ -59,11 +59,11 @@ def test_orders_may_be_numpy_integers():
         (Lags(na=2.0), "`na` must be whole numbers"),
         (
             Lags(na=[1, 2]),
-            "`na` has 2 numbers but there are 1 outputs; give one number, or one per output",
+            "`na` has 2 numbers for 1 output; give one number, or one per output",
         ),
         (
             Lags(nk=[1]),
-            "`nk` has 1 numbers but there are 2 inputs; give one number, or one per input",
+            "`nk` has 1 number for 2 inputs; give one number, or one per input",
         ),
     ],
 )

@@ -78,15 +78,23 @@ class FilePart(Part):
             first = max(start, skip)
             if len(experiment) < least:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
-                    f"few; at least {least} determine where a run of this motion starts."
+                    f"{experiment.source}: data.{self.name} has "
+                    f"{plural(len(experiment), 'row')}, too few; at least {least} determine where "
+                    "a run of this motion starts."
                 )
             if len(experiment) <= first:
                 raise InputError(
-                    f"{experiment.source}: data.{self.name} has {len(experiment)} rows, too "
-                    f"few; the first {first} are lags or skipped, so at least {first + 1} are "
-                    "needed."
+                    f"{experiment.source}: data.{self.name} has "
+                    f"{plural(len(experiment), 'row')}, too few; {_unscored(first)}, so at least "
+                    f"{first + 1} are needed."
                 )
+
+
+def _unscored(first: int) -> str:
+    """Return which rows at the start have no score."""
+    return (
+        f"the first {first} are lags or skipped" if first > 1 else "the first is a lag or skipped"
+    )
 
 
 def long_stretches(
@@ -113,7 +121,7 @@ def long_stretches(
     long = tuple(e for e, own in pairs if len(e) > max(first, own) and len(e) >= least)
     if not long:
         most = max(len(e) for e in record.experiments)
-        needed = f"the first {max(first, skip)} are lags or skipped"
+        needed = _unscored(max(first, skip))
         needed = f"at least {least} are needed" if most < least else needed
         raise InputError(
             f"{record.experiments[0].source}: {what}the longest stretch between missing "

@@ -150,6 +150,10 @@ def open_explained(
         reading = trained or ReadOptions("auto", prepare=True)
         reading = replace(reading, rows=rows or reading.rows, missing=missing or reading.missing)
         opened.append(open_run(model, path, reading=reading))
+        if not opened[-1].model.learns:
+            from orthaug.selection.learned_linearization import NO_LEARNER
+
+            raise InputError(f"{model}: {NO_LEARNER}")
         taken = rows_taken(trained) if trained and not rows else ""
         notes += opened[-1].notes
         notes += (

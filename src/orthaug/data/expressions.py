@@ -14,6 +14,7 @@ import re
 import unicodedata
 import warnings
 from collections.abc import Container, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -45,6 +46,7 @@ RESERVED = frozenset((*FUNCTIONS, "k"))
 SAMPLING_TIME = "Ts"  # a name that need not be declared: it is the record's sampling time
 LARGEST_LAG = 100_000  # more is a mistake, and would fill the memory
 _MAX_LENGTH = 500  # characters; a longer expression is a mistake, and messages stay readable
+_TRIES = 20  # one in a hundred fails where two threads do nothing but parse
 _BINARY = {
     ast.Add: lambda a, b: a + b,
     ast.Sub: lambda a, b: a - b,
@@ -83,7 +85,7 @@ class Expression:
     @cached_property
     def tree(self) -> ast.expr:
         """Its syntax, of whitelisted nodes only where `parse` made it."""
-        return ast.parse(self.text, mode="eval").body
+        return syntax_tree(self.text).body
 
     @cached_property
     def lags(self) -> tuple[Lag, ...]:
@@ -272,10 +274,22 @@ def parse_named(
         raise InputError(f"{where}: {error}") from None
 
 
+def syntax_tree(text: str) -> ast.Expression:
+    """Return Python's syntax tree of an expression, whatever other threads parse meanwhile.
+
+    CPython before 3.11.8 and 3.12.2 raises SystemError where the garbage collector lets another
+    thread parse in between, as JAX's callback does (gh-106905). The text is not the cause.
+    """
+    for _ in range(_TRIES):
+        with suppress(SystemError):
+            return ast.parse(text, mode="eval")
+    return ast.parse(text, mode="eval")
+
+
 def _read(text: str, constants: Mapping[str, float]) -> Expression:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Python's own remarks about text that is refused below
-        tree = ast.parse(text, mode="eval").body
+        tree = syntax_tree(text).body
     used: set[str] = set()
     _check(tree, text, constants, used)
     return Expression(text, tuple((name, float(constants[name])) for name in sorted(used)))
@@ -458,7 +472,7 @@ def with_names(expression: Expression, names: Mapping[Lag, str]) -> str:
             raise InputError(
                 f"'{expression.text}': {lag} is not among {', '.join(map(str, names))}."
             )
-    return ast.unparse(Named().visit(ast.parse(expression.text, mode="eval")))
+    return ast.unparse(Named().visit(syntax_tree(expression.text)))
 
 
 def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:

@@ -63,8 +63,8 @@ def _per_channel(
     values: list[Any] = list(given) if several else [given] * len(names)
     if len(values) != len(names):
         raise InputError(
-            f"`{key}` has {len(values)} numbers but there are {len(names)} {kind}s; give one "
-            f"number, or one per {kind}."
+            f"`{key}` has {plural(len(values), 'number')} for {plural(len(names), kind)}; give "
+            f"one number, or one per {kind}."
         )
     if any(isinstance(v, bool) or not isinstance(v, int | np.integer) or v < 0 for v in values):
         raise InputError(f"`{key}` must be whole numbers, 0 or more; got {show(value)}.")

@@ -182,7 +182,11 @@ def _lower_lagged(model: Model, name: str, digest: str) -> Program:
         for i, summands in enumerate(sums):
             correction = total([Entry("g", i), *corrections[i]])
             summands.append(correction if held is None else held.fade(correction))
-    block = Block("output", () if held is None else held.locals, network, tuple(map(total, sums)))
+    results = tuple(map(total, sums))
+    read = (*results, *(network.features if network is not None else ()))
+    defined = {} if held is None else dict(held.locals)
+    # x̄ of a lag that the physics does not read would be an unused variable of C
+    block = Block("output", _needed_definitions(defined, read), network, results)
     lines = tuple((_signal(channels[channel]), depth) for channel, depth in memory.depths)
     states = tuple(
         Signal(str(lag), f"{identifier(lag.channel)}_{lag.lag}", channels[lag.channel].unit)

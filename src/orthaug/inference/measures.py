@@ -287,8 +287,14 @@ def _normalise(weights: Vector, count: int, what: str) -> Vector:
         raise InputError("the weights must be numbers.") from None
     if values.shape != (count,):
         raise InputError(f"there are {values.shape} weights for {count} {what}; give one for each.")
-    if not np.isfinite(values).all() or np.any(values < 0) or values.sum() <= 0:
-        raise InputError("the weights must be finite, none negative, and not all zero.")
+    wrong = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
+    if len(wrong):
+        raise InputError(
+            f"weight {wrong[0]} of the {what}, counted from 0, is {values[wrong[0]]:g}; expected "
+            "a finite number, 0 or more."
+        )
+    if values.sum() <= 0:
+        raise InputError(f"the weights of the {what} are all 0; expected one above.")
     return values / values.sum()
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, as_signal
 from orthaug._base.errors import InputError
 from orthaug._base.jax import Array, jax, jnp
+from orthaug._base.lines import plural
 from orthaug.data.record import Experiment, Record
 from orthaug.data.regressors import lag_rows
 from orthaug.models.dynamics import Dynamics, Numbers, Parts, in_batches, last_outputs
@@ -181,8 +182,9 @@ class PastOutputs:
         rows = _check_outputs(initial, len(model.outputs))
         if len(rows) < model.form.memory:
             raise InputError(
-                f"`initial` has {len(rows)} rows; expected the first {model.form.first_row} "
-                "outputs of the record."
+                f"`initial` has {plural(len(rows), 'row')}; expected the outputs of the "
+                f"{plural(model.form.first_row, 'row')} before the first usable one, or of at "
+                f"least the last {model.form.memory} of them."
             )
         return rows
 

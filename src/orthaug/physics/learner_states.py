@@ -62,8 +62,8 @@ def check_time_constants(given: object, states: int) -> tuple[float, ...] | None
     listed = tuple(given) if isinstance(given, list | tuple) else ()
     if not listed or len(listed) != states or not all(is_number(t) and t > 0 for t in listed):
         raise InputError(
-            "`time_constants` must be one positive number in s for each of the learner's "
-            f"{states} states; got {show(given)}."
+            "`time_constants` must be one positive number in s for each state of the learner, "
+            f"{states} in all; got {show(given)}."
         )
     return tuple(float(t) for t in listed)
 

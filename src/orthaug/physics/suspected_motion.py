@@ -11,7 +11,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import ArrayModule
-from orthaug.data.expressions import Expression
+from orthaug.data.expressions import Expression, syntax_tree
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 
@@ -173,7 +173,7 @@ def factor_of(equation: str, parameter: str) -> str | None:
         '((b*u - 1)/L) - ((b*u - 0)/L)'
         >>> factor_of("b*u - s*x**3", "s")
     """
-    tree = ast.parse(equation, mode="eval")
+    tree = syntax_tree(equation)
     above = {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
     places = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id == parameter]
     if len(places) != 1 or 2 * len(equation) > _LONGEST:

@@ -98,6 +98,12 @@ class LearnedLinearization:
         return np.einsum("oi,mi->mo", self.weight, self.target).ravel()
 
 
+NO_LEARNER = (
+    "the model is physics alone: it has no learner that could be explained. Fit it with a learner "
+    "that sees what the missing terms may depend on."
+)
+
+
 def signals_seen(model: Model) -> tuple[str, ...]:
     """Return what a learner sees, as expressions."""
     features = model.form.features
@@ -111,10 +117,7 @@ def linearization_of(model: Model, record: Record) -> LearnedLinearization:
         InputError: a model without a learner, other channels, too few rows, or none with a value.
     """
     if not model.learns:
-        raise InputError(
-            "the model is physics alone: it has no learner that could be explained. Fit it "
-            "with a learner that sees what the missing terms may depend on."
-        )
+        raise InputError(NO_LEARNER)
     linearization = _OF_FORM[type(model.form)](model, record)
     if len(linearization.target) < FEWEST:
         raise InputError(
