@@ -9,8 +9,10 @@ import pytest
 import scipy.integrate
 
 import orthaug as oa
+from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.learned_part import learned_reach
 from orthaug.analysis.missing_terms import MissingTest, doubted_equations
+from orthaug.analysis.physics_findings import imitable
 from orthaug.analysis.predictability import Predictable
 from orthaug.analysis.residuals import analyse
 from orthaug.analysis.robustness import robust_free_run
@@ -330,6 +332,13 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     assert fit.values[0] == pytest.approx(-np.log(decay) / TS, abs=3 * fit.std[0])
     (found,) = [warning.text for warning in fit.warnings if warning.code == "not_identified"]
     assert found.startswith("not identified: b. ") and "the prior of the weights" in found
+    assert "the data determine all parameters but b" in fit.summary()
+    given = Evidence(
+        parts=(), problem=fit.problem, learner=oa.MLP(), structure=oa.Orthogonal(), criterion=WHOLE
+    )
+    imitated, _ = imitable(fit, given)
+    assert imitated is not None and imitated.determined == ("a",)
+    assert "the data determine all of them but b" in imitated.text
 
 
 def test_the_band_of_what_is_learned_follows_all_that_was_estimated(

@@ -65,10 +65,9 @@ def fitted(one_step: float = 0.01, free_run: float = 0.1, **given: Any) -> FitRe
     return FitResult.model_construct(
         data=DATA,
         status=STATUS,
-        scores=scored(one_step, free_run),
         physical_parameters=None,
         motion=None,
-        **options | given,
+        **{"scores": scored(one_step, free_run)} | options | given,
     )
 
 
@@ -105,6 +104,15 @@ def test_a_refuted_model_is_of_use_for_the_next_sample_only_where_that_is_predic
     )
     assert "predict the next" not in fit_verdict(fitted(0.4, 3.0)).use
     assert "simulate within" in fit_verdict(fitted(0.7, 0.1)).use
+
+
+def test_a_model_that_is_far_off_its_own_data_is_not_usable_by_a_short_test():
+    trained = {"train": scored(0.05, 0.9)["tests.far"]}
+    found = fit_verdict(fitted(scores=scored(0.05, 0.3) | trained))
+    assert found.level == "bad"
+    assert "free run on the training data is 90 % of the output" in found.trust
+    diverging = fit_verdict(fitted(scores=scored(0.05, 1.2) | trained))
+    assert "free run on tests.far is 120 % of the output" in diverging.trust
 
 
 def test_a_noise_model_keeps_feedback_right_and_predicts_where_its_free_run_drifts():

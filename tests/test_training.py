@@ -25,8 +25,9 @@ from orthaug import (
     estimate,
 )
 from orthaug.fitting.free_run import FreeRunTask
-from orthaug.fitting.held_out import Ratio, mean_square
+from orthaug.fitting.held_out import HeldOutErrors, Ratio, mean_square
 from orthaug.fitting.status import Ending
+from orthaug.fitting.training import _physics_fails
 from orthaug.models.learners import Bound
 
 OPTIONS = {"learner": NETWORK, "criterion": FREE, "solver": LM}
@@ -75,6 +76,24 @@ def test_where_no_learner_is_better_the_result_is_physics_alone(seed):
     assert found.status.loss == found.status.start_loss and not any(
         run.chosen for run in found.restarts
     )
+
+
+@pytest.mark.parametrize(
+    ("spread", "own", "fails"),
+    [
+        (80, 0.31, True),  # the end of one block is an extrapolation
+        (80, 0.51, False),  # not clearly lower than physics on all rows
+        (0, 0.31, False),  # surely worse
+    ],
+)
+def test_physics_alone_that_fails_on_its_own_data_replaces_no_undecided_learner(spread, own, fails):
+    """As of an oscillation: on a short block physics errs by 0.1, on all rows by 1."""
+    far, alone = np.where(np.arange(100) < spread, 0.01, 6.0), np.full(100, 0.1)
+    near = far if spread == 0 else np.full(100, 0.01)
+    held_out = HeldOutErrors("blocks", tuple("1234"), [alone] * 4, ([far, near, near, near],))
+    assert held_out.ratio.value > 1
+    assert _physics_fails(held_out, own, alone=1.0) == fails
+    assert not _physics_fails(held_out, own, alone=None)
 
 
 def test_the_fallback_can_be_declined():

@@ -89,7 +89,7 @@ class Imitation:
         """Return it with the parameters of these groups as determined by no data.
 
         Args:
-            groups: parameters whose effects depend linearly on each other.
+            groups: parameters whose effects depend linearly on each other, or on the learner.
         """
         lost = tuple(dict.fromkeys(name for group in groups for name in group))
         others = tuple(

@@ -105,6 +105,8 @@ def _(fit: MotionEstimate, evidence: Evidence) -> tuple[Imitation | None, list[W
         return None, []
     seen = [str(entry) for entry in fit.model.form.features]
     found, form = MotionImitation.of(seen, fit.shared), fit.model.form
+    if fit.unidentified:
+        found = found.beside_collinear([fit.unidentified])
     if form.motion.memory:
         record = fit.problem.record
         first = replace(record, experiments=record.experiments[:1])

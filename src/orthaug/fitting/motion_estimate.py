@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, check_type
 from orthaug._base.errors import Warning
+from orthaug._base.lines import join_words
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate
 from orthaug.fitting.field_points import field_under, wobble
@@ -225,7 +226,7 @@ class MotionEstimate(Estimate):
                 f"{self.effective_weights:.1f} effective"
             )
             split = [
-                f"shared      {shared_in_words(self.shared)}",
+                f"shared      {shared_in_words(self.shared, self.unidentified)}",
                 f"measure     {self.split_by.name}",
             ]
         steps = f"{form.substeps} substep{'s' * (form.substeps > 1)}"
@@ -297,14 +298,20 @@ def _doubts(
     return warnings
 
 
-def shared_in_words(shared: SharedDirections) -> str:
-    """Return the directions that the learner could imitate, in words."""
+def shared_in_words(shared: SharedDirections, unidentified: Sequence[str] = ()) -> str:
+    """Return the directions that the learner could imitate, in words.
+
+    Args:
+        unidentified: parameters that neither the fit nor the nearest physics determines.
+    """
     if not shared.basis.size:
-        return "nothing: the data determine all parameters"
+        excepted = f" but {join_words(unidentified)}" if unidentified else ""
+        return f"nothing: the data determine all parameters{excepted}"
     if shared.all:
         return "all parameters: they are those of the physics nearest to the fitted motion"
     moved = [" with ".join(direction) for direction in shared.directions]
+    determined = [name for name in shared.untouched if name not in unidentified]
     return (
         f"{'; '.join(moved)} (by the nearest physics); determined by the fit: "
-        f"{', '.join(shared.untouched) or 'none'}"
+        f"{', '.join(determined) or 'none'}"
     )

@@ -48,6 +48,7 @@ from orthaug.models.rows import Engine
 _INFLATION = 1.4
 # rows · parameters · iterations of free runs on one block: about 2 s on one core
 _FOLD_WORK = 2.5e7
+_CLEARLY = 0.5  # of a mean square: less than this is clearly lower
 
 
 def fold_solver(
@@ -175,7 +176,10 @@ def train(
         held_out = replace(held_out, chosen=best)
         runs_freely = task.criterion.free_run is not None and task.start_loss is not None
         replaces = choice.fallback and task.bound.learns and runs_freely
-        if replaces and not held_out.ratio.value < 1:
+        fails = choice.validation is None and _physics_fails(
+            held_out, float(ranking[best]), task.start_loss
+        )
+        if replaces and not (held_out.ratio.value < 1 or fails):
             replacing, best = [_fell_back(held_out)], -1
             LOG.info(
                 "no free run is better than physics alone on held-out rows: the result is "
@@ -228,6 +232,19 @@ def _converged_beside(best: int, runs: Sequence[FinishedRun], errors: np.ndarray
     others = np.where(ended, errors, np.inf)
     other = int(np.argmin(others))
     return other if others[other] <= (1 + WORTH) ** 2 * errors[best] else best
+
+
+def _physics_fails(held_out: HeldOutErrors, own: float, alone: float | None) -> bool:
+    """Return whether physics alone is far off its own data where blocks do not decide.
+
+    The errors of an oscillation grow along a run, and a block is short. Where the learner's is
+    clearly lower on rows that it was not fitted to, physics alone is no result to prefer.
+
+    Args:
+        own: loss of the chosen run, or its error on blocks where that is higher.
+        alone: loss of physics alone.
+    """
+    return alone is not None and held_out.ratio.low < 1 and own < _CLEARLY * alone
 
 
 def _physics_to_compare(task: Task, structure: Structure) -> Estimate | None:
