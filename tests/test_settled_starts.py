@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug.analysis import scoring
+from orthaug.data.part import Part
 
 STEP = 0.02
 
@@ -76,3 +78,22 @@ def test_a_prediction_does_not_depend_on_how_many_others_are_made() -> None:
     every = predict(170)
     for rows in (85, 40):
         np.testing.assert_allclose(predict(rows), every[: len(predict(rows))], atol=1e-9)
+
+
+def test_long_records_are_predicted_in_blocks_that_give_the_score(record, monkeypatch):
+    """Each predicted row is that of the whole prediction, and the others are not scored."""
+    fit = oa.estimate(record, pendulum(22.0, 0.3), learner=None)
+    part = Part("tests.long", record)
+    whole, (every, _) = scoring.score_part(fit.model, part, [])
+    monkeypatch.setattr(scoring, "_MOST_PREDICTED", 400)
+    spread, (few, free) = scoring.score_part(fit.model, part, [])
+    (one,), (other,) = every.trajectories, few.trajectories
+    assert one.chosen is None and other.chosen.sum() == 400
+    assert (np.isfinite(other.model[:, 0]) == other.chosen).all()
+    np.testing.assert_allclose(other.model[other.chosen], one.model[other.chosen], rtol=1e-6)
+    errors = (one.measured - one.model)[other.chosen]
+    assert spread.prediction.rmse == pytest.approx(np.sqrt(np.mean(errors**2, axis=0)), rel=1e-6)
+    assert spread.prediction.rmse == pytest.approx(whole.prediction.rmse, rel=0.1)
+    assert spread.simulation == whole.simulation and free.trajectories[0].chosen is None
+    complete, _ = scoring.score_part(fit.model, part, [], whole=True)
+    assert complete == whole

@@ -98,13 +98,18 @@ def score_and_analyse(fit: Estimate, evidence: Evidence) -> Examination:
     scores, responses = {}, {}
     if fit.status.ok:
         for part in evidence.parts:
-            scores[part.name], responses[part.name] = score_part(fit.model, part, warnings)
+            scores[part.name], responses[part.name] = score_part(
+                fit.model, part, warnings, whole=part is evidence.train
+            )
     if fit.status.ok:
         described = _limits_described(evidence.train.record, responses[evidence.train.name][1])
         warnings = [warning for warning in warnings if warning not in described]
     physics, alone, ran = fit.physics_alone, {}, {}
     if physics is not None and physics.status.ok:
-        ran = {part.name: score_part(physics.model, part, []) for part in evidence.parts}
+        ran = {
+            part.name: score_part(physics.model, part, [], whole=part is evidence.train)
+            for part in evidence.parts
+        }
         alone = {name: scored for name, (scored, _) in ran.items()}
     one_step = isinstance(evidence.criterion, Prediction) or fit.model.coloured
     if fit.status.ok and one_step and fit.learns:

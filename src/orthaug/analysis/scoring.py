@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,20 +17,31 @@ from orthaug.fitting.colour import correlation_length
 from orthaug.models.long_runs import scores_along
 from orthaug.models.model import Model
 from orthaug.models.response import Response
+from orthaug.models.starts import EstimatedStates
 
 _MEMORIES = 3  # times as long a block as the differences of squared errors are correlated
 _FEWEST = 8  # blocks for a standard error
+# Rows of an experiment: so many give the score of its prediction to about a percent
+_MOST_PREDICTED = 10_000
 _SURE = 2.0  # standard errors
 
 
 def score_part(
-    model: Model, part: Part, warnings: list[Warning]
+    model: Model, part: Part, warnings: list[Warning], *, whole: bool = False
 ) -> tuple[PartScores, tuple[Response, Response]]:
     """Return the scores of a part, and the responses that they come from.
 
     A missing score adds a warning.
+
+    Args:
+        whole: predict every row one step ahead, also where each has a state of its own to estimate
+            and they are many.
     """
-    responses = model.predict(part.record), model.simulate(part.record)
+    starts = model.starts
+    ahead = model
+    if isinstance(starts, EstimatedStates) and not whole:
+        ahead = replace(model, starts=replace(starts, most=_MOST_PREDICTED))
+    responses = ahead.predict(part.record), model.simulate(part.record)
     if part.source is not None:
         return _score_along(model, part, warnings), responses
     scores = {}

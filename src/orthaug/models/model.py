@@ -194,7 +194,9 @@ class Model(RecordModel[Form], NotebookView):
         record = self.fitting(record, need_outputs=True)
         trajectories = []
         for experiment in record.experiments:
-            first, parts, physics, forecast = self.starts.predict(self, experiment, record, horizon)
+            first, parts, physics, forecast, chosen = self.starts.predict(
+                self, experiment, record, horizon
+            )
             ahead = trajectory(parts, experiment, experiment.outputs, first)
             if physics is not None:
                 known = np.full(experiment.outputs.shape, np.nan)
@@ -203,6 +205,8 @@ class Model(RecordModel[Form], NotebookView):
             if forecast is not None:
                 ahead = replace(ahead, whole=ahead.model.copy())
                 ahead.model[first:] += forecast
+            if chosen is not None:
+                ahead = replace(ahead, chosen=np.r_[np.zeros(first, dtype=bool), chosen])
             trajectories.append(ahead)
         return Response(tuple(trajectories), horizon, self.outputs, record.sampling_time)
 

@@ -106,6 +106,8 @@ class Trajectory:
     std: Matrix | None = None
     steps: Vector | None = None
     """Seconds (N,) from each row to the next, where they are uneven."""
+    chosen: Bool[np.ndarray, "N"] | None = None
+    """The rows that are predicted, and scored, where some are left out to save time."""
 
     def time(self, sampling_time: float) -> Vector:
         """Return the instants (N,) of the rows in s, the first of them 0."""
@@ -127,6 +129,14 @@ class Trajectory:
     @property
     def model(self) -> Matrix:
         return self.baseline + self.learner if self.whole is None else self.whole
+
+    @property
+    def scored(self) -> Matrix:
+        """What is measured, NaN where the model was not run (N, ny)."""
+        assert self.measured is not None, "of a record with measured outputs"
+        if self.chosen is None:
+            return self.measured
+        return np.where(self.chosen[:, None], self.measured, np.nan)
 
     @property
     def errors(self) -> Matrix:
@@ -201,7 +211,7 @@ class Response:
             if trajectory.measured is None:
                 raise InputError("the record has no measured outputs to compare with.")
             rows = slice(max(trajectory.start, first), None)
-            measured.append(trajectory.measured[rows])
+            measured.append(trajectory.scored[rows])
             model.append(trajectory.model[rows])
         if not sum(len(m) for m in measured):
             raise InputError(f"no samples are left to score after the first {max(skips)}.")

@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector, as_signal
 from orthaug._base.errors import InputError
@@ -43,6 +43,7 @@ _PRIOR = 1e-9  # of a state at the first row that the inputs do not show, beside
 
 FIRST_ROWS = 64  # from which the start of a free run is estimated
 _SIDE_BY_SIDE = 256  # windows of predictions
+_BLOCKS = 20  # of a long record, of which not every row is predicted
 _WINDOW_CELLS = 8_000_000  # input cells of a batch of multi-step predictions
 _GUESS_ITERATIONS = 30
 # Iterations of a window, and the decrease that ends it: within 0.0003 of the state's own noise
@@ -59,6 +60,8 @@ class Predicted(NamedTuple):
     physics: Matrix | None = None
     forecast: Matrix | None = None
     """Errors that a noise model expects there."""
+    chosen: Bool[np.ndarray, "m"] | None = None
+    """The rows with a prediction, where some are left out to save time; NaN elsewhere."""
 
 
 @runtime_checkable
@@ -250,6 +253,24 @@ class PastOutputs:
         return lag_rows(record, model.form.layout)
 
 
+def _spread(rows: int, most: int | None) -> Bool[np.ndarray, "m"] | None:
+    """Return which rows are in blocks spread over all; None where these are not too many."""
+    if most is None or rows <= most:
+        return None
+    size = max(most // _BLOCKS, 1)
+    chosen = np.zeros(rows, dtype=bool)
+    for first in np.linspace(0, rows - size, most // size).round().astype(int):
+        chosen[first : first + size] = True
+    return chosen
+
+
+def _unchosen_left_out(values: Matrix, chosen: Bool[np.ndarray, "m"]) -> Matrix:
+    """Return values of chosen rows as values of all, NaN elsewhere."""
+    found = np.full((len(chosen), values.shape[1]), np.nan)
+    found[chosen] = values
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class EstimatedStates:
     """The state is estimated over a window of measured rows: `Starts` of a motion.
@@ -259,6 +280,8 @@ class EstimatedStates:
 
     window: int
     loose: Vector
+    most: int | None = None
+    """Rows of an experiment that are predicted at most, in blocks spread over it; None for all."""
 
     def rows(self, form: MotionDynamics) -> int:
         return self.window
@@ -325,9 +348,14 @@ class EstimatedStates:
         if model.learns:
             alone = model.physics_only
             ends.append((alone.form, alone.numbers))
+        first, chosen = window + horizon - 1, _spread(len(begins), self.most)
+        if chosen is not None:
+            begins = begins[chosen]
         outputs = self._ahead(model, experiment, record, (window, horizon), begins, ends)
-        nothing = np.zeros_like(outputs[0])
-        return Predicted(window + horizon - 1, Parts(outputs[0], nothing, nothing), outputs[-1])
+        if chosen is not None:
+            outputs = [_unchosen_left_out(own, chosen) for own in outputs]
+        nothing = np.where(np.isnan(outputs[0]), np.nan, 0.0)
+        return Predicted(first, Parts(outputs[0], nothing, nothing), outputs[-1], chosen=chosen)
 
     def errors(
         self,
