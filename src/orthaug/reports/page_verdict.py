@@ -65,7 +65,7 @@ def fit_verdict(result: Findings) -> PageVerdict:
     doubts = list(_doubts(result, held_out=held_out))
     error, part = _worst_score(result.scores)
     own, _ = _worst_score({k: v for k, v in result.scores.items() if k == "train"})
-    if own is not None and own > max(_POOR, error or 0.0):  # a short test hides errors that grow
+    if own is not None and own > _POOR >= (error or 0.0):  # a short test hides errors that grow
         error, part = own, "train"
     unstable = _has_warning(result, _UNSTABLE)  # no score of a free run judges it
     bad = (
