@@ -307,7 +307,11 @@ def test_what_keeps_its_sign_has_no_jump_at_zero() -> None:
         "quadratic_drag of h",
         "cubic of h",
     ]
-    assert "curved in h" in replace(best, variable="h", shape="square", one_sided=True).meaning
+    assert "curved in h" in replace(best, variable="h", shape="square", side=1).meaning
+    level = replace(best, variable="h", shape="linear", width=2.0)
+    assert level.term == "(max(h - 2, 0) + min(h + 2, 0))"
+    assert replace(level, side=1).term == "max(h - 2, 0)"
+    assert replace(level, side=-1).term == "min(h + 2, 0)"
 
 
 def test_friction_that_turns_round_smoothly_is_no_drag() -> None:

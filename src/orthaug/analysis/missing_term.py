@@ -87,8 +87,8 @@ class MissingTerm(Placed):
     shape: str
     coefficient: float
     share: float
-    one_sided: bool = False
-    """True if the variable keeps its sign over the data: nothing is then known of odd and even."""
+    side: int = 0
+    """The sign that the variable keeps over the data, 0 where it changes it."""
     factors: tuple[str, ...] = ()
     """Of a product, its variables; `variable` is then the product itself, linear in it the term."""
     width: float | None = None
@@ -129,7 +129,13 @@ class MissingTerm(Placed):
                 return term
             return f"({term} {'-' if self.reference >= 0 else '+'} {abs(self.reference):.4g})"
         size = f"{self.width:.4g}"
-        return f"(max({self.variable} - {size}, 0) + min({self.variable} + {size}, 0))"
+        above, below = f"max({self.variable} - {size}, 0)", f"min({self.variable} + {size}, 0)"
+        return f"({above} + {below})" if not self.side else above if self.side > 0 else below
+
+    @property
+    def one_sided(self) -> bool:
+        """True if the variable keeps its sign: nothing is then known of odd and even."""
+        return self.side != 0
 
     @property
     def expression(self) -> str:
@@ -201,8 +207,8 @@ class Sizes(NamedTuple):
     """Largest values, signs and widths of the variables along the runs."""
 
     largest: Vector
-    one_sided: list[bool]
-    """True for those that keep their sign."""
+    sides: list[int]
+    """The signs of those that keep theirs, 0 of the others."""
     widths: Matrix
     """Widths (w, n) in units of the largest size."""
 
@@ -213,7 +219,13 @@ class Sizes(NamedTuple):
         largest = size.max(axis=1, initial=0.0)
         largest = np.where(largest > 0, largest, 1.0)
         widths = np.quantile(size / largest[:, None], shares, axis=1)
-        return cls(largest, [not changes_sign(one) for one in values], widths)
+        sides = [0 if changes_sign(one) else 1 if np.sum(one) > 0 else -1 for one in values]
+        return cls(largest, sides, widths)
+
+    @property
+    def one_sided(self) -> list[bool]:
+        """True for those that keep their sign."""
+        return [side != 0 for side in self.sides]
 
 
 def variables_of(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
@@ -265,8 +277,8 @@ def term_of(
     if number < tried.simple:
         variable, shape = divmod(number - 1, len(SHAPES))
         coefficient /= float(largest[variable]) ** POWERS[shape]
-        one_sided = sizes.one_sided[variable]
-        return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, one_sided)
+        side = sizes.sides[variable]
+        return MissingTerm(equation, names[variable], SHAPES[shape], coefficient, share, side)
     number -= tried.simple
     if number < len(tried.products):
         first, second, a, b = tried.products[number]
@@ -281,4 +293,4 @@ def term_of(
     size = float(largest[variable])
     width = size * float(sizes.widths[level, variable])
     made = (equation, names[variable], BEYOND, coefficient / size, share)
-    return MissingTerm(*made, sizes.one_sided[variable], width=width)
+    return MissingTerm(*made, sizes.sides[variable], width=width)

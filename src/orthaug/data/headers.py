@@ -22,6 +22,7 @@ _UNITS = re.compile(
     r"bar|mbar|K|degC|degF|kg|J|kJ|ohm|percent|m_s2?|rad_s2?|l_min|kg_s"
 )
 _BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]$")
+_INDEX, _RATIO = re.compile(r"[\d:,\s]+"), re.compile(r"\s\[1\]$")
 _TIME = re.compile(
     r"^(t|times?|time[ _]?stamp|zeit|zeitstempel|uhrzeit|datum|date([ _/]?time)?|"
     r"elapsed([ _]?time)?|sec|seconds|msec|millis(econds)?|minutes|hours|days|"
@@ -65,7 +66,7 @@ _COMMA = r"(:\d\d),(\d+)"
 def split_header(header: str) -> tuple[str, str]:
     """Return name and unit of a header: `force [N]`, `force (N)`, `force_N`.
 
-    An index, as in `U[2]`, is no unit.
+    An index, as in `U[2]`, is no unit; the 1 in `grade [1]` is that of a ratio.
 
     The number that follows columns of one name stays with the name: `force [N].1` is `force.1`
     in N.
@@ -75,7 +76,7 @@ def split_header(header: str) -> tuple[str, str]:
         base, unit = split_header(numbered[1])
         return (base + numbered[2], unit) if unit else (header, "")
     found = _BRACKETS.match(header)
-    if found and found[1] and not re.fullmatch(r"[\d:,\s]+", found[2]):
+    if found and found[1] and (_RATIO.search(header) or not _INDEX.fullmatch(found[2])):
         return found[1].strip(), found[2].strip()
     for cut in (i for i, letter in enumerate(header) if letter == "_" and i):
         if _UNITS.fullmatch(header[cut + 1 :]):

@@ -269,8 +269,8 @@ def _doubts(
     if split.slope is None:
         text = (
             "the distance between the fitted motion and the physics has no unique minimum near "
-            f"the estimate, so there are no intervals. Its curvature is {split.curvature:.2g} "
-            "of that at a good fit: several parameters could explain what the learner found."
+            "the estimate, so there are no intervals: several parameters could explain what the "
+            "learner found."
         )
         warnings.append(Warning("not_unique", text))
     if at_bound:

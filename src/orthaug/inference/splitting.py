@@ -238,10 +238,6 @@ class MotionSplit(MeasureSplit):
     shared: SharedDirections
     share: float | None = None
     """‖learner‖ / ‖field‖ of the learned equations over the measure, after the split."""
-    curvature: float = 1.0
-    """Smallest eigenvalue of the second derivative of the distance, over that of a rest that is
-    zero.
-    """
     field: Field
 
     @classmethod
@@ -437,18 +433,16 @@ def split_motion(
     if not shared.basis.size:
         return replace(split, slope=whole, share=share)
     b = _unit(shared.basis, gauss)
-    inner, flat, left = b.T @ second @ b, b.T @ gauss @ b, b.T @ gradient
-    along = float(left @ np.linalg.lstsq(flat, left, rcond=None)[0])
+    inner, left = b.T @ second @ b, b.T @ gradient
+    along = float(left @ np.linalg.lstsq(b.T @ gauss @ b, left, rcond=None)[0])
     defect = float(np.sqrt(max(along, 0.0) / learner)) if learner > 0 else None
-    lowest = float(np.linalg.eigvalsh(inner).min())
-    curvature = lowest / max(float(np.linalg.eigvalsh(flat).min()), 1e-300)
     slope = None
-    if lowest > _FLAT:
+    if np.linalg.eigvalsh(inner).min() > _FLAT:
         cross = np.concatenate([to_c + second, to_w], axis=1) + (
             0.0 if wobble is None else wobble(q)
         )
         slope = whole - b @ np.linalg.solve(inner, b.T @ cross)
-    return replace(split, slope=slope, defect=defect, share=share, curvature=curvature)
+    return replace(split, slope=slope, defect=defect, share=share)
 
 
 def _learned_rows(form: MotionDynamics, q: AnyArray, x: Array, u: Array) -> Array:
