@@ -6,6 +6,7 @@ import gc
 import os
 import platform
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place.get(item.path.stem, len(place)))
 
 
+_UNTIL = "ORTHAUG_TESTS_UNTIL"  # set by the first process for the workers: seconds of the clock
+_NO_TIME = "no time was left"
+
+
+def pytest_configure() -> None:
+    """With MINUTES in the environment no test begins after so many; what is left out is counted at the end."""
+    if minutes := os.environ.get("MINUTES"):
+        os.environ.setdefault(_UNTIL, str(time.time() + 60 * float(minutes)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Leave out what would begin too late."""
+    if time.time() > float(os.environ.get(_UNTIL, "inf")):
+        pytest.skip(_NO_TIME)
+
+
 def pytest_collection_finish() -> None:
     """What was imported and collected stays: looking for garbage in it would take a twentieth of the time."""
     gc.freeze()
@@ -114,6 +132,10 @@ _CRASHED: set[str] = set()
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """What the proofs have measured, as the tables of benchmarks/README.md."""
+    skipped = terminalreporter.getreports("skipped")
+    late = sum(_NO_TIME in str(report.longrepr) for report in skipped)
+    if late:
+        terminalreporter.write_line(f"{late} tests were left out: {_NO_TIME}.")
     ended = [
         report
         for outcome in ("passed", "failed")
