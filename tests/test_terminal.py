@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.progress import TimeElapsedColumn, TimeRemainingColumn
 from test_cli import SPEC, make_project, run
 from typer.main import get_command
 
@@ -273,3 +274,15 @@ def test_a_number_and_its_per_cent_stay_on_one_line() -> None:
         "The intervals of",
         "  95 % count noise",
     ]
+
+
+def test_a_bar_shows_brackets_and_fits_the_terminal(monkeypatch):
+    text = "trials of advice: the term max(min(u[k-1], 1.514), -1.514) in the equation of v"
+    monkeypatch.setattr(bars, "on_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    bar = bars.drawn_bar(TimeElapsedColumn(), TimeRemainingColumn())
+    bar.add_task(text, total=10, completed=3)
+    with bar.console.capture() as shown:
+        bar.console.print(bar.get_renderable())
+    (line,) = shown.get().splitlines()
+    assert line.startswith("trials of advice: the term max(min(u[k-1], ") and len(line) <= 80

@@ -65,10 +65,14 @@ def drawn_bar(*columns: ProgressColumn, transient: bool = True) -> Bar:
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
+    from rich.table import Column
 
-    shown = (TextColumn("{task.description}"), BarColumn(), *columns)
+    console = Console(stderr=True)
+    # Of a long description, such as that of a change of the spec, the bar leaves the beginning
+    described = Column(no_wrap=True, overflow="ellipsis", max_width=max(console.width - 30, 20))
+    shown = (TextColumn("{task.description}", markup=False, table_column=described), BarColumn())
     return Progress(
-        *shown, console=Console(stderr=True), transient=transient, disable=not on_terminal()
+        *shown, *columns, console=console, transient=transient, disable=not on_terminal()
     )
 
 
