@@ -17,6 +17,7 @@ import numpy as np
 
 from orthaug._base.checks import Vector, check_choice, check_count, check_type, is_number
 from orthaug._base.errors import InputError, Warning, show
+from orthaug._base.lines import plural
 from orthaug._base.progress import SILENT, ProgressCallback
 from orthaug.data.record import Record
 from orthaug.data.regressors import Lags
@@ -527,7 +528,7 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
         raise InputError(
-            f"`initial` has {bound.ny} outputs, the record {len(problem.outputs)}; fit anew."
+            f"`initial` has {plural(bound.ny, 'output')}, the record {len(problem.outputs)}; fit anew."
         )
     problem = problem.for_linear_learner() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, model.scaling, np.asarray(numbers.gain), engine)
