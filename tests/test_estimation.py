@@ -185,7 +185,7 @@ def test_initial_refused(record, short):
     (e,) = record.experiments
     twice = Record.from_arrays(e.inputs, np.hstack([e.outputs, 2 * e.outputs]), outputs=["y", "z"])
     physics = Baseline.from_terms([Term("a", "y[k-1]", output="y"), Term("b", "u[k]", output="z")])
-    with pytest.raises(InputError, match="`initial` has 1 outputs, the record 2; fit anew"):
+    with pytest.raises(InputError, match="`initial` has 1 output, the record 2; fit anew"):
         estimate(twice, physics, initial=short)
 
 

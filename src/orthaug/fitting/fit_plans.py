@@ -528,7 +528,8 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
         raise InputError(
-            f"`initial` has {plural(bound.ny, 'output')}, the record {len(problem.outputs)}; fit anew."
+            f"`initial` has {plural(bound.ny, 'output')}, the record {len(problem.outputs)}; fit "
+            "anew."
         )
     problem = problem.for_linear_learner() if model.form.features.linear else problem
     task = OneStepTask.of(problem, bound.learner, model.scaling, np.asarray(numbers.gain), engine)
