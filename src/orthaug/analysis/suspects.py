@@ -176,7 +176,7 @@ class Suspect:
 
         Examples:
             >>> Suspect.of("dead_zone", on="u[k-1]", width=0.5).expression
-            '(u[k-1]) - max(min(u[k-1], 0.5), -0.5)'
+            'u[k-1] - max(min(u[k-1], 0.5), -0.5)'
         """
         text, label, on = suspect_text(
             kind, on, width, lambda text: parse(text, constants), "v[k-1]", time_constant
