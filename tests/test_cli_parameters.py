@@ -661,7 +661,10 @@ BAD_SPLITS = [
         ["out", "run.csv", "--measure", "samples", "--samples", "lacking.csv"],
         "lacking.csv: no column 'y[k-2]'",
     ),
-    (["out", "run.csv", "--measure", "samples", "--samples", "negative.csv"], "weight 0 of the samples"),
+    (
+        ["out", "run.csv", "--measure", "samples", "--samples", "negative.csv"],
+        "weight 0 of the samples",
+    ),
     (
         ["out", "run.csv", "--measure", "weighted"],
         "--weights is missing; expected the files that hold the weights",

@@ -24,6 +24,7 @@ from orthaug import (
     Term,
     estimate,
 )
+from orthaug._base import progress
 from orthaug.fitting.free_run import FreeRunTask
 from orthaug.fitting.held_out import HeldOutErrors, Ratio, mean_square
 from orthaug.fitting.status import Ending
@@ -54,6 +55,22 @@ def test_the_lowest_error_on_held_out_blocks_is_chosen():
     assert [run.chosen for run in found.restarts] == [error == min(errors) for error in errors]
     assert found.held_out.ratio.code == "helps" and found.held_out.ratio.high < 1
     assert found.learns
+
+
+def test_a_run_shows_its_model_while_it_lasts_and_ends_as_without(monkeypatch):
+    shown = []
+    monkeypatch.setattr(progress, "_SHOWN_EVERY", 0.0)
+    progress.follow_training(lambda stage: None, lambda *one: shown.append(one))
+    try:
+        followed = estimate(record(), PHYSICS, restarts=1, blocks=0, **OPTIONS)
+    finally:
+        progress.stop_following()
+    alone = estimate(record(), PHYSICS, restarts=1, blocks=0, **OPTIONS)
+    names = [name for name, *_ in shown]
+    assert names[0] == "physics alone" and set(names[1:]) == {"orthogonal"} and len(names) > 4
+    losses = [fit.status.loss for _, fit, _ in shown[1:]]
+    assert losses[-1] < losses[0] and np.isfinite(losses).all()
+    assert followed.theta == pytest.approx(alone.theta, rel=1e-12)
 
 
 def test_the_lowest_generalised_cross_validation_is_chosen_one_step_ahead_and_told():

@@ -7,6 +7,7 @@ of results.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -52,6 +53,7 @@ class ReachedStage(NamedTuple):
         return cls(stage, text)
 
 
+_SHOWN_EVERY = 3.0  # s: how often the model of a run that has not ended is shown
 _STAGE_LOG, _MODEL_LOG = LOG.getChild("stage"), LOG.getChild("model")
 _MODEL_LOG.propagate = False  # its records are no text
 
@@ -69,6 +71,21 @@ def show_model(name: str, fit: Callable[[], object], record: object) -> None:
         _MODEL_LOG.info("%s", name, extra={"fit": fit(), "record": record})
     except Exception:  # it is shown only: training goes on
         LOG.debug("a model of training cannot be shown", exc_info=True)
+
+
+def watch_run(name: str, record: object) -> Watch | None:
+    """Return what shows the fit of a run every few seconds; None where nobody follows."""
+    if not _MODEL_LOG.handlers:
+        return None
+    shown = time.monotonic()
+
+    def watch(fit: Callable[[], object]) -> None:
+        nonlocal shown
+        if time.monotonic() - shown >= _SHOWN_EVERY:
+            show_model(name, fit, record)
+            shown = time.monotonic()
+
+    return watch
 
 
 def follow_training(
@@ -114,6 +131,10 @@ Plan = Sequence[Mapping[str, Any]]
 
 RunProgress = Callable[[int, float], None]
 """Progress callback of one run: called with its iteration and the loss."""
+
+
+Watch = Callable[[Callable[[], Any]], None]
+"""Called between the steps of a run with what makes its present end, which costs time."""
 
 
 class StopTraining(Exception):

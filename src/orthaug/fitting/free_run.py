@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from orthaug._base.checks import Vector
-from orthaug._base.progress import RunProgress, quiet
+from orthaug._base.progress import RunProgress, Watch, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.elimination import Fixed, settle
@@ -226,6 +226,7 @@ class FreeRunTask(SimulationTask):
         structure: Structure,
         regularization: str | float = "none",
         progress: RunProgress = quiet,
+        watched: Watch | None = None,
     ) -> FreeRunFit:
         """Run, with an orthogonal θ at a bound as a known term beside the learner.
 
@@ -242,7 +243,7 @@ class FreeRunTask(SimulationTask):
         def evaluate(fixed: Fixed, solver: LevenbergMarquardt = solver) -> Fixed | None:
             own = replace(self, plan=replace(self.plan, fixed=fixed))
             free_fits.append(
-                super(FreeRunTask, own).run(solver, w, structure, regularization, progress)
+                super(FreeRunTask, own).run(solver, w, structure, regularization, progress, watched)
             )
             end, objective = free_fits[-1].end, free_fits[-1].objective
             assert isinstance(objective, StructuredObjective)

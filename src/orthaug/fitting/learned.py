@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
 from orthaug._base.jax import AnyArray
-from orthaug._base.progress import RunProgress, quiet
+from orthaug._base.progress import RunProgress, Watch, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.criteria import Criterion
@@ -151,8 +151,12 @@ class Task(Protocol):
         structure: Structure,
         regularization: str | float = "none",
         progress: RunProgress = quiet,
+        watched: Watch | None = None,
     ) -> FinishedRun:
-        """Return one run from the weights `w`; arguments as in `estimate`."""
+        """Return one run from the weights `w`; arguments as in `estimate`.
+
+        `watched` may follow it, as a run that has not ended.
+        """
         ...
 
     def refined(self, run: Any, solver: Solver, structure: Structure) -> tuple[Task, Any]:

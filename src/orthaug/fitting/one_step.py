@@ -12,7 +12,7 @@ import numpy as np
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import Array, jnp
-from orthaug._base.progress import RunProgress, quiet
+from orthaug._base.progress import RunProgress, Watch, quiet
 from orthaug.data.record import Record
 from orthaug.data.regressors import Features
 from orthaug.data.sources import RecordSource, witness
@@ -177,10 +177,12 @@ class OneStepTask(TrainingRows):
         structure: Structure | None = None,
         regularization: str | float = "none",
         progress: RunProgress = quiet,
+        watched: Watch | None = None,
     ) -> compiled.TrainingRun:
         """Return one run from the weights `w`.
 
-        The arguments as in `estimate`, `structure` None for no penalty.
+        The arguments as in `estimate`, `structure` None for no penalty. It is compiled whole, so
+        that nothing is there to be `watched`.
 
         Over very many rows its iterations are those over all of them, its seconds those over the
         few as well.

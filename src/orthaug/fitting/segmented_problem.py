@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, padded_length
-from orthaug._base.progress import RunProgress, quiet
+from orthaug._base.progress import RunProgress, Watch, quiet
 from orthaug.data.record import Record
 from orthaug.fitting.checkpoints import OF_DESCENT, Checkpoints, RunCheckpoint
 from orthaug.fitting.criteria import Criterion, Simulation
@@ -171,6 +171,7 @@ class SegmentedProblem:
         solver: LevenbergMarquardt,
         progress: RunProgress = quiet,
         states: np.ndarray | None = None,
+        watched: Watch | None = None,
         **options: Any,
     ) -> FreeRunFit:
         """Descend from p to the end of the run.
@@ -179,13 +180,20 @@ class SegmentedProblem:
 
         Args:
             states: of the segments' starts at p; None for the measured ones.
+            watched: follows the run, as a `FreeRunFit` that has not ended.
             options: of `minimize.minimize`.
         """
+
+        def ended(end: Any) -> FreeRunFit:
+            mean_square = self.mean_square(end.point.c, end.point.w)
+            return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
+
         ny = len(self.dynamics.outputs)
         options |= {
             "bounds": objective.bounds,
             "damping": MARQUARDT,
             "noticeable": noticeable_in(self.residuals),
+            "watched": watched and (lambda make: watched(lambda: ended(make()))),
         }
         two_legs = ny > 1 and self.output_weights in ("auto", "covariance")
         first = solver.at_most(solver.iterations // 2) if two_legs else solver
@@ -218,8 +226,7 @@ class SegmentedProblem:
                 done=spent["iterations"], limit=solver.iterations
             )
             end = again._replace(path=path, tail=tail, **spent)
-        mean_square = self.mean_square(end.point.c, end.point.w)
-        return FreeRunFit(objective, end, mean_square, end.iterations, end.seconds)
+        return ended(end)
 
     def _checkpoint(
         self, objective: FreeRunObjective, p: Vector, start: Start, options: dict[str, object]

@@ -15,7 +15,7 @@ import numpy as np
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.errors import Warning
-from orthaug._base.progress import RunProgress, quiet
+from orthaug._base.progress import RunProgress, Watch, quiet
 from orthaug.fitting.block_scores import FreeRunScores
 from orthaug.fitting.checkpoints import Checkpoints
 from orthaug.fitting.criteria import Criterion
@@ -170,10 +170,11 @@ class SimulationTask(ABC):
         structure: Structure,
         regularization: str | float = "none",
         progress: RunProgress = quiet,
+        watched: Watch | None = None,
     ) -> FreeRunFit:
         """Return one run from the weights `w`; a silent learner and physics alone are tried too.
 
-        The arguments as in `estimate`.
+        The arguments as in `estimate`; `watched` follows the run.
 
         An earlier model is gone on from where it is better than physics alone. A learner that
         cannot be silenced starts with its weights, from the best θ for them.
@@ -193,7 +194,7 @@ class SimulationTask(ABC):
 
         report = plan.reporting(progress)
         options: dict[str, Any] = {"ridge": ridge, "evidence": evidence, "evidence_settled": True}
-        kept = {"ceiling": ceiling}
+        kept: dict[str, Any] = {"ceiling": ceiling, "watched": watched}
         first = None
         # The weights of a memory are needed only when others have grown: too late for evidence
         if not (evidence and remembers(self.bound.learner)):

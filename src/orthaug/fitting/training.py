@@ -16,7 +16,7 @@ from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import jax
 from orthaug._base.lines import plural
 from orthaug._base.parallel import Threads, one_blas_thread
-from orthaug._base.progress import LOG, ProgressCallback, Stage, show_model
+from orthaug._base.progress import LOG, ProgressCallback, Stage, show_model, watch_run
 from orthaug.data.record import Record
 from orthaug.fitting.estimates import Estimate, Restart
 from orthaug.fitting.held_out import (
@@ -335,7 +335,8 @@ def _run(
     runner: Engine | Threads,
 ) -> tuple[list[PlannedRun], list[FinishedRun]]:
     """Return every planned run; one that fails is made again from the seeds that follow."""
-    made, given, record = list(starts), (task, solver, structure), task.problem.record
+    made, record = list(starts), task.problem.record
+    given = (task, solver, structure, made[0])
     runs: list[Any] = []
     for run in runner.map(_one_run, given, made, progress):
         runs.append(run)
@@ -365,10 +366,15 @@ def _conclude_briefly(task: Task, structure: Structure, run: object) -> Estimate
 
 
 def _one_run(
-    given: tuple[Task, Solver, Structure], start: PlannedRun, report: Callable[..., None]
+    given: tuple[Task, Solver, Structure, PlannedRun],
+    start: PlannedRun,
+    report: Callable[..., None],
 ) -> FinishedRun:
-    task, solver, structure = given
-    return task.run(solver, start.weights, structure, start.regularization, report)
+    """Make a run; the first shows its model until it ends."""
+    task, solver, structure, first = given
+    show = watch_run(structure.name, task.problem.record) if start is first else None
+    watched = show and (lambda run: show(lambda: _conclude_briefly(task, structure, run())))
+    return task.run(solver, start.weights, structure, start.regularization, report, watched)
 
 
 def _replacement_warnings(

@@ -174,7 +174,10 @@ class TrainingView:
                 label = "Free run on the training data, so far."
                 plot(curves_figure(list(rows.items())), label)
                 text(
-                    f"{label[:-1]}: its first rows, with the best run that has ended.", "p", "hint"
+                    f"{label[:-1]}: its first rows, with the first run while it lasts and then "
+                    "the best that has ended.",
+                    "p",
+                    "hint",
                 )
 
     def _tell(self, command: Command) -> None:

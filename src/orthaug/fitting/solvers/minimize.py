@@ -20,7 +20,7 @@ from jaxtyping import Bool
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import training_clock
-from orthaug._base.progress import RunProgress, StopTraining, quiet
+from orthaug._base.progress import RunProgress, StopTraining, Watch, quiet
 from orthaug.fitting.solvers import damped_step
 from orthaug.fitting.solvers.damped_step import MARQUARDT, Damping, StepControl
 from orthaug.fitting.solvers.limit import Limit, Tail
@@ -83,6 +83,7 @@ class Settings:
         evidence: choose α by MacKay's re-estimation after accepted steps.
         progress: called after the steps.
         kept: where states are kept; a run goes on from the last one.
+        watched: called after the steps with the state.
     """
 
     limit: Limit
@@ -92,6 +93,7 @@ class Settings:
     evidence: bool = False
     progress: RunProgress = quiet
     kept: CheckpointWriter | None = None
+    watched: Callable[[Any], None] | None = None
 
     def runs(self, state: RunState) -> bool:
         """Return whether there is a step to take."""
@@ -107,6 +109,8 @@ class Settings:
             return True
         if self.kept is not None:
             self.kept.keep(packed, ended=int(state.control.code) != Ending.RUNNING)
+        if self.watched is not None:
+            self.watched(state)
         return False
 
     def drive(
@@ -391,6 +395,7 @@ def minimize(
     bounds: tuple[Vector, Vector] | None = None,
     progress: RunProgress = quiet,
     kept: CheckpointWriter | None = None,
+    watched: Watch | None = None,
 ) -> Descent:
     """Minimize `‖r‖² + α‖w‖²` from p.
 
@@ -403,10 +408,25 @@ def minimize(
         ceiling: a trial with a larger `‖r‖²` is rejected.
         bounds: of θ, each (physics,); the start is moved inside.
         kept: where pauses are kept; a run goes on from the last one.
+        watched: follows the run, as a `Descent` that has not ended.
 
     The rest is that of `Settings`.
     """
     began = training_clock()
+
+    def descent(iterate: _Iterate, ending: Ending) -> Descent:
+        return Descent(
+            iterate.point,
+            iterate.linear,
+            iterate.ridge,
+            effective_weights(iterate.linear.hessian, iterate.ridge, objective.physics),
+            iterate.iteration,
+            ending,
+            training_clock() - began,
+            iterate.path,
+            settings.tail(iterate),
+        )
+
     settings = Settings(
         limit=limit,
         tolerance=tolerance,
@@ -415,6 +435,7 @@ def minimize(
         evidence=evidence,
         progress=progress,
         kept=kept,
+        watched=watched and (lambda iterate: watched(partial(descent, iterate, Ending.RUNNING))),
     )
     lower, upper = (np.full(len(p), side) for side in (-np.inf, np.inf))
     if bounds is not None:
@@ -427,18 +448,7 @@ def minimize(
         first = rules.begin(p, start, evidence_begun=not evidence_settled)
     if not isinstance(first, _Iterate):
         return Descent(first, None, ridge, 0.0, 0, Ending.NON_FINITE, training_clock() - began)
-    end, ending = settings.drive(first, rules.advance, partial(_pause, objective))
-    return Descent(
-        end.point,
-        end.linear,
-        end.ridge,
-        effective_weights(end.linear.hessian, end.ridge, objective.physics),
-        end.iteration,
-        ending,
-        training_clock() - began,
-        end.path,
-        settings.tail(end),
-    )
+    return descent(*settings.drive(first, rules.advance, partial(_pause, objective)))
 
 
 def _pause(objective: Any, iterate: _Iterate) -> Pause:
