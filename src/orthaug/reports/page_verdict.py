@@ -64,13 +64,12 @@ def fit_verdict(result: Findings) -> PageVerdict:
         held_out = len(result.scores) > 1
     doubts = list(_doubts(result, held_out=held_out))
     error, part = _worst_score(result.scores)
-    own, _ = _worst_score({k: v for k, v in result.scores.items() if k == "train"})
+    own, _ = _worst_score({"train": result.scores["train"]} if "train" in result.scores else {})
     if own is not None and own > _POOR >= (error or 0.0):  # a short test hides errors that grow
         error, part = own, "train"
     unstable = _has_warning(result, _UNSTABLE)  # no score of a free run judges it
     bad = (
-        _has_warning(result, _RAN_AWAY)
-        or _has_warning(result, _NO_FREEDOM)
+        any(_has_warning(result, code) for code in (_RAN_AWAY, _NO_FREEDOM))
         or (error is not None and error > _POOR and not unstable)
         or _code(result) == "hurts"
     )
@@ -266,13 +265,12 @@ def _worst_score(
         kind: `prediction` for that of one step ahead.
     """
     held_out = {part: score for part, score in scores.items() if part != "train"} or scores
-    found = {}
+    found = []
     for part, score in held_out.items():
         values = score.kinds[kind].nrmse
         if values is not None and None not in values:
-            found[part] = float(np.sqrt(np.mean(np.square(np.array(values, dtype=float)))))
-    part = max(found, key=found.__getitem__) if found else ""
-    return (found[part], part) if found else (None, "")
+            found.append((float(np.sqrt(np.mean(np.array(values, dtype=float) ** 2))), part))
+    return max(found, key=lambda one: one[0], default=(None, ""))
 
 
 def _code(result: Findings | RowResult) -> str | None:
