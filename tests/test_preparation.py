@@ -428,7 +428,15 @@ def test_training_files_are_prepared_again_for_a_split_and_for_tracking(decimate
     done = run("track", "result", "--data", "run.csv", "--training", "run.csv", "--out", "tracked")
     assert done.code == 0, done.err
     assert "the model was fitted to prepared data" in done.err
-    done = run("explain", "result", "run.csv")
+    spec = (decimated / "plant.toml").read_text(encoding="utf-8")
+    without_input = spec.replace('[[baseline.terms]]\nparameter = "c"\nregressor = "u[k-1]"\n', "")
+    (decimated / "learned.toml").write_text(
+        without_input.replace('kind = "none"', 'kind = "terms"\nterms = ["u[k-1]"]'),
+        encoding="utf-8",
+    )
+    done = run("fit", "learned.toml", "--out", "learned")
+    assert done.code == 0, done.err
+    done = run("explain", "learned", "run.csv")
     assert "prepared data: detrend" in done.err and "1 sample marked as missing" in unfolded(
         done.err
     ), done.err
