@@ -341,6 +341,24 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     assert "the data determine all of them but b" in imitated.text
 
 
+def test_a_parameter_whose_effect_the_data_do_not_want_is_named():
+    """The spring softens, and the physics lets it only harden: K of x³/K grows for ever."""
+    rng = np.random.default_rng(5)
+    u, x = np.repeat(rng.uniform(-1, 1, 40), 10), [0.0]
+    for value in u[:-1]:
+        x.append(x[-1] + TS * (-x[-1] + 0.1 * x[-1] ** 3 + value))
+    record = oa.Record.from_arrays(
+        u=u, y=np.array(x) + 0.01 * rng.normal(size=400), sampling_time=TS
+    )
+    motion = oa.Motion.from_equations(
+        [oa.State("x", "-a*x - x**3/K + u")], [oa.Output("y", "x")], positive(a=0.5, K=15.0), ["u"]
+    )
+    fit = oa.estimate(record, motion, learner=None, criterion=WHOLE)
+    assert fit.unidentified == ("K",)
+    (found,) = [warning.text for warning in fit.warnings if warning.code == "not_identified"]
+    assert "K went from 15 to " in found and "where no output depends on it" in found
+
+
 def test_the_band_of_what_is_learned_follows_all_that_was_estimated(
     fitted: oa.MotionEstimate,
 ) -> None:

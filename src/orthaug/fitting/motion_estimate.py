@@ -160,7 +160,7 @@ class MotionEstimate(Estimate):
         at_bound = {name: float(value) for name, value, there in values if there}
         made = replace(self, split_by=split, at_bound=at_bound)
         unseen = made._unidentified_by(self.model.statistics)
-        doubts = [*self._ill_conditioned(q), *_doubts(split, at_bound, unseen, self.learns)]
+        doubts = [*self._ill_conditioned(q), *_doubts(split, at_bound, unseen, self)]
         made = super(MotionEstimate, made)._with_split(split, (*doubts, *warnings))
         return replace(made, unidentified=unseen)
 
@@ -263,7 +263,7 @@ def _wider_without_prior(joint: JointCovariance, slope: Matrix) -> Vector:
 
 
 def _doubts(
-    split: MotionSplit, at_bound: Collection[str], unseen: tuple[str, ...], learns: bool
+    split: MotionSplit, at_bound: Collection[str], unseen: tuple[str, ...], fit: MotionEstimate
 ) -> list[Warning]:
     warnings = []
     if split.slope is None:
@@ -287,13 +287,24 @@ def _doubts(
             "so there is no interval. Measure more, fix one of them as a constant, give the "
             "learner fewer inputs, or add it to fewer equations."
         )
-        if not learns:
+        if not fit.learns:
             text = (
                 f"not identified: {', '.join(unseen)}. Other values, with others of the other "
                 "parameters, give nearly the same outputs, so there is no interval. Give some of "
                 "them as constants, or record data that depend more on "
                 f"{'it' if len(unseen) == 1 else 'them'}."
             )
+        text += "".join(
+            f" {p.name} went from {p.initial:.3g} to {value:.3g}, where no output depends on it: "
+            "physics without its effect follows the data as well. Leave out its term, or bound it."
+            for p, value, lost in zip(
+                fit.coordinates.parameters,
+                fit.coordinates.physical(split.theta),
+                fit.coordinates.lost(split.theta),
+                strict=True,
+            )
+            if lost and p.name in unseen
+        )
         warnings.append(Warning("not_identified", text))
     return warnings
 

@@ -56,7 +56,6 @@ _SHORT_ITERATIONS = 15  # over segments that are not the last
 _SETTLING = 25
 _LOWER = 0.98  # of the misfit: what other starts of the segments must leave
 # Of a logarithm, from its initial value: a parameter that far off may move no output any more
-_FAR = np.log(1e4)
 _STARTS = 8  # drawn, where the declared initial values lead nowhere
 _WIDE = np.log(5.0)  # deviation of a start: of a logarithm, else twice the value
 _CHEAP = 1_000_000  # operations of a pass over the record's equations
@@ -139,7 +138,7 @@ def _from_lost_parameters(
     depends on its logarithm any more: no descent brings it back by itself.
     """
     coordinates, point = own.problem.motion.coordinates, best.end.point
-    lost = np.asarray(coordinates.positive) & (np.abs(point.theta - coordinates.initial) > _FAR)
+    lost = coordinates.lost(point.theta)
     if not lost.any():
         return best
     theta = np.where(lost, coordinates.initial, point.theta)

@@ -31,6 +31,7 @@ _CONVERTS = re.compile(r"(?<![\w.])(60|1440|3600|86400|1000|1e3|0\.001|1e-3)(\.0
 _FACTORS = {60.0, 1440.0, 3600.0, 86400.0, 1000.0, 0.001, 1 / 60, 1 / 3600, 1 / 86400}
 AGREEMENT = 1e-6  # relative difference up to which a term's `initial` is what the physics gives
 
+_FAR = np.log(1e4)
 _SMALLEST = math.exp(-30.0)  # of p⁰: a positive parameter that is smaller is zero
 _STEP = 1e-100  # h relative to p: h² vanishes beside 1, and products with h are far from underflow
 
@@ -199,6 +200,13 @@ class Coordinates:
         """Return a mask of the entries of q that are not at a bound: one there is a constant."""
         low, high = self.bounds
         return (low < q) & (q < high)
+
+    def lost(self, q: Vector) -> Bool[np.ndarray, "np"]:
+        """Return a mask of the positive parameters that left the order of size of their start.
+
+        Such a one is so near to zero, or so large, that no output depends on it any more.
+        """
+        return self.positive & (np.abs(q - self.initial) > _FAR)
 
 
 @dataclass(frozen=True)
