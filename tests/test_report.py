@@ -22,12 +22,12 @@ from orthaug import Channel, Response, Trajectory
 from orthaug._base.errors import Warning
 from orthaug.analysis.findings import BiasResult
 from orthaug.analysis.fit_findings import ParameterResult
-from orthaug.commands.compare import compare_report
+from orthaug.commands.compare import page_of
 from orthaug.commands.folder import check_folder
 from orthaug.commands.job import origin_of
 from orthaug.models.response import Scores
 from orthaug.reports.learned_part import Curve, curve_limits
-from orthaug.reports.page import fit_page
+from orthaug.reports.page import compare_page, fit_page
 from orthaug.reports.page_blocks import interval, number, percent
 from orthaug.reports.page_compare import ComparePage, compare_sections
 from orthaug.reports.page_figures import interval_plot
@@ -111,7 +111,7 @@ def pages(lagged, motion, compared):
     return {
         "lagged": lagged.report().html,
         "motion": motion.report().html,
-        "compared": compare_report(compared),
+        "compared": compare_page(page_of(compared)),
     }
 
 

@@ -13,7 +13,7 @@ from test_cli import MLP, SPEC, make_project
 
 import orthaug as oa
 from orthaug import Channel, Response, Trajectory
-from orthaug.commands.compare import compare_report
+from orthaug.commands.compare import page_of
 from orthaug.commands.fit import write_result
 from orthaug.commands.job import origin_of
 from orthaug.reports.page import compare_page, fit_page
@@ -60,7 +60,7 @@ def folder(tmp_path_factory) -> Path:
     beside = oa.compare([str(folder / "one"), str(folder / "other")])
     pages = {
         "fit": fitted.report().html,
-        "compared": compare_report(oa.compare(fitted.job)),
+        "compared": compare_page(page_of(oa.compare(fitted.job))),
         "saved": compare_page(ComparePage(beside.origin, beside.result, beside.responses)),
         "long": fit_page(long),
     }

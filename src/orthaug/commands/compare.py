@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from orthaug.analysis.fit_findings import parameter_rows
 from orthaug.analysis.scoring import equal_within_noise, score_part
 from orthaug.analysis.validation import Verdict, dominance
 from orthaug.commands.fit import FitReport, fit_variant
+from orthaug.commands.folder import save_json
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant, origin_of
 from orthaug.data.record import same_step
 from orthaug.fitting.criteria import Criterion, Prediction
@@ -27,6 +28,9 @@ from orthaug.models.response import Response
 from orthaug.reports import plots
 from orthaug.reports.page_verdict import best_row
 from orthaug.reports.result import CompareResult, RowResult
+
+if TYPE_CHECKING:
+    from orthaug.reports.page_compare import ComparePage
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,23 +157,29 @@ def _verdicts(job: Job, fitted: dict[str, FitReport]) -> dict[str, Verdict]:
 def write(comparison: Comparison, folder: Path, *, force: bool = False) -> None:
     """Write result.json, models/, figures/ and report.html, whole or not at all."""
     with whole_folder(folder, force=force) as partial:
-        (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
         for kind, fitted in comparison.fitted.items():
             if fitted.fit.status.ok:
                 place = partial / "models" / kind.replace(" ", "-")
                 place.mkdir(parents=True)
                 storage.write(fitted.fit.model, place)
-        Stage.FIGURES.enter()
-        (partial / "figures").mkdir()
-        figure = plots.comparison_figure(comparison.result.comparison)
-        plots.save(figure, partial / "figures" / "comparison.png")
-        Stage.REPORT.enter()
-        (partial / "report.html").write_text(compare_report(comparison), encoding="utf-8")
+        write_report(page_of(comparison), partial)
 
 
-def compare_report(comparison: Comparison) -> str:
-    """Return the page of a comparison."""
+def write_report(page: ComparePage, folder: Path) -> None:
+    """Write result.json, figures/ and report.html of a comparison."""
     from orthaug.reports.page import compare_page
+
+    save_json(page.result, folder)
+    Stage.FIGURES.enter()
+    (folder / "figures").mkdir()
+    figure = plots.comparison_figure(page.result.comparison)
+    plots.save(figure, folder / "figures" / "comparison.png")
+    Stage.REPORT.enter()
+    (folder / "report.html").write_text(compare_page(page), encoding="utf-8")
+
+
+def page_of(comparison: Comparison) -> ComparePage:
+    """Return what the page of a comparison shows."""
     from orthaug.reports.page_compare import ComparePage
 
     responses = {
@@ -177,9 +187,7 @@ def compare_report(comparison: Comparison) -> str:
         for name, fitted in comparison.fitted.items()
         if fitted.responses
     }
-    return compare_page(
-        ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses)
-    )
+    return ComparePage(origin_of(comparison.job, "compare"), comparison.result, responses)
 
 
 def _load_matching(path: Path, job: Job) -> Model:

@@ -21,7 +21,7 @@ from orthaug.analysis.evidence import Evidence
 from orthaug.analysis.examination import Examination, score_and_analyse, was_stopped, with_verdict
 from orthaug.commands import job_result
 from orthaug.commands.chosen_rows import after_choice
-from orthaug.commands.folder import PHYSICS
+from orthaug.commands.folder import PHYSICS, save_json
 from orthaug.commands.job import AS_DECLARED, MISSING_STATE, Job, Variant, origin_of
 from orthaug.fitting.estimates import Estimate
 from orthaug.reports.page_verdict import is_biased_by_feedback
@@ -201,7 +201,7 @@ def fill_result(fitted: FitReport, folder: Path) -> None:
     """Write the files of a result into an existing folder."""
     from orthaug.models import storage
 
-    (folder / "result.json").write_text(fitted.result.to_json() + "\n", encoding="utf-8")
+    save_json(fitted.result, folder)
     if not fitted.fit.status.ok:
         return
     (folder / "model").mkdir()

@@ -51,6 +51,11 @@ def results_beside(model: Path) -> Iterator[Any]:
             yield json.loads((folder / "result.json").read_text(encoding="utf-8"))
 
 
+def save_json(result: Any, folder: Path) -> None:
+    """Write the result of a command as the result.json of its folder."""
+    (folder / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
+
+
 def check_folder(folder: Path, *, force: bool = False) -> None:
     """Raise InputError early where the result could not be written."""
     date_of_results()

@@ -112,9 +112,19 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         A term of an input acts as that does, wherever it is. None where the equation has the term
         already.
         """
+        if (found := self._added_term(job, name, expression, place)) is None:
+            return None
+        change, where = found
+        parameter = {"initial": initial} | selected_form(expression)
+        return change | {f"motion.parameters.{name}": parameter}, where
+
+    def _added_term(
+        self, job: Job, name: str, expression: str, place: str | None
+    ) -> tuple[dict[str, Any], str] | None:
+        """Return the equations with a term, and where it is."""
         from orthaug.physics.suspected_motion import equations_of, usual_places
 
-        motion = self.motion
+        motion, added = self.motion, f"{name}*({expression})"
         if motion.functions is not None or not _reads_only(motion, expression):
             return None
         varying = (*motion.names_of_states, *motion.inputs)
@@ -127,29 +137,20 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             own = now["expression"]
             if _has_term(own, expression, varying):
                 return None
-            change = {
-                f"motion.outputs.{place}": now | {"expression": f"{own} + {name}*({expression})"},
-                f"motion.parameters.{name}": {"initial": initial} | selected_form(expression),
-            }
+            change = {f"motion.outputs.{place}": now | {"expression": f"{own} + {added}"}}
             return change, f"in the equation of the output {place}"
         if place in motion.inputs:
-            return self._beside_input(job, str(place), name, expression, initial)
+            return self._beside_input(job, str(place), added), f"beside the input {place}"
         if place not in motion.names_of_states:
             return None
         key = motion.equation_key
         own = str(job.declaration["motion"]["states"][place][key])
         if _has_term(own, expression, varying):
             return None
-        change = {
-            f"motion.states.{place}.{key}": f"{own} + {name}*({expression})",
-            f"motion.parameters.{name}": {"initial": initial} | selected_form(expression),
-        }
-        return change, f"in the equation of {place}"
+        return {f"motion.states.{place}.{key}": f"{own} + {added}"}, f"in the equation of {place}"
 
-    def _beside_input(
-        self, job: Job, place: str, name: str, expression: str, initial: float
-    ) -> tuple[dict[str, Any], str] | None:
-        """Return the change that adds a term to an input in the equations and definitions."""
+    def _beside_input(self, job: Job, place: str, added: str) -> dict[str, Any]:
+        """Return the equations and definitions with a term beside an input."""
         key, declared = self.motion.equation_key, job.declaration["motion"]
         word = re.compile(rf"\b{re.escape(place)}\b")
         texts = {
@@ -160,14 +161,12 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             f"motion.define.{defined}": str(text)
             for defined, text in declared.get("define", {}).items()
         }
-        added = f"({place} + {name}*({expression}))"
-        change: dict[str, Any] = {
-            path: word.sub(lambda _: added, text)
+        both = f"({place} + {added})"
+        return {
+            path: word.sub(lambda _: both, text)
             for path, text in texts.items()
             if word.search(text)
         }
-        change[f"motion.parameters.{name}"] = {"initial": initial} | selected_form(expression)
-        return change, f"beside the input {place}"
 
     def with_lag(
         self, job: Job, late: LateInputResult, name: str

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
-from orthaug.commands.compare import choose_row, row_of, with_equal_rows
+from orthaug.commands.compare import choose_row, row_of, with_equal_rows, write_report
 from orthaug.commands.folder import results_beside
 from orthaug.commands.job import surroundings, toml_of
 from orthaug.commands.parts import load_parts
@@ -22,7 +22,6 @@ from orthaug.fitting.status import Ending
 from orthaug.models import storage
 from orthaug.models.model import Model
 from orthaug.models.response import Response
-from orthaug.reports import plots
 from orthaug.reports.page_fit import Origin
 from orthaug.reports.result import (
     CompareResult,
@@ -149,16 +148,11 @@ def compare_results(found: Sequence[SavedResult], arguments: Sequence[str]) -> S
 
 def write(comparison: SavedComparison, folder: Path, *, force: bool = False) -> None:
     """Write result.json, figures/ and report.html, whole or not at all."""
-    from orthaug.reports.page import compare_page
     from orthaug.reports.page_compare import ComparePage
 
     page = ComparePage(comparison.origin, comparison.result, comparison.responses)
     with whole_folder(folder, force=force) as partial:
-        (partial / "result.json").write_text(comparison.result.to_json() + "\n", encoding="utf-8")
-        (partial / "figures").mkdir()
-        figure = plots.comparison_figure(comparison.result.comparison)
-        plots.save(figure, partial / "figures" / "comparison.png")
-        (partial / "report.html").write_text(compare_page(page), encoding="utf-8")
+        write_report(page, partial)
 
 
 def _read(path: Path) -> SavedResult:

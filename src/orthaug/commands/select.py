@@ -14,7 +14,7 @@ from orthaug._base.errors import InputError
 from orthaug._base.folders import whole_folder
 from orthaug.commands.chosen_rows import parts_of, split_rows
 from orthaug.commands.data_sections import EngineSection, engine_of
-from orthaug.commands.folder import relative
+from orthaug.commands.folder import relative, save_json
 from orthaug.commands.job import Job
 from orthaug.commands.opening import open_spec
 from orthaug.commands.spec import LearnerSection, Spec, load_spec
@@ -124,7 +124,7 @@ def write_selected(selected: SelectionReport, folder: Path, *, force: bool = Fal
     from orthaug.reports.plots import selection_figure
 
     with whole_folder(folder, force=force) as partial:
-        (partial / "result.json").write_text(selected.result.to_json() + "\n", encoding="utf-8")
+        save_json(selected.result, partial)
         (partial / "spec.toml").write_text(selected.spec, encoding="utf-8")
         selected.selection.table.to_csv(partial / "table.csv", index=False)
         (partial / "figures").mkdir()

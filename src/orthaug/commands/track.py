@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.folders import file_digest, whole_folder
 from orthaug.analysis.fit_findings import parameter_rows, physical_rows
-from orthaug.commands.folder import results_beside
+from orthaug.commands.folder import results_beside, save_json
 from orthaug.commands.run import ReadOptions, missing_notes, prepared_notes, record_for
 from orthaug.commands.split import open_training
 from orthaug.data.record import Record
@@ -196,7 +196,7 @@ def write_tracked(tracked: TrackingReport, folder: Path, text: str, *, force: bo
     physical = None if tracked.physics is None else online.physical_history(tracked.physics)
     alarms = [alarm.time for alarm in online.alarms]
     with whole_folder(folder, force=force) as partial:
-        (partial / "result.json").write_text(result.to_json() + "\n", encoding="utf-8")
+        save_json(result, partial)
         (partial / "report.txt").write_text(text + "\n", encoding="utf-8")
         history.to_csv(partial / "table.csv")
         if physical is not None:

@@ -23,6 +23,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
+from orthaug._base.columns import span
 from orthaug.data.expressions import Lag
 from orthaug.data.regressors import Features, Layout
 from orthaug.physics.baseline import Baseline
@@ -203,7 +204,7 @@ def spanned_directions(
         learned: which slopes have a learner; the others must not move at all.
     """
     kept = np.isfinite(slopes).all(axis=(0, 2)) & np.isfinite(features).all(axis=1)
-    slopes, q = slopes[:, kept], _basis(features[kept])
+    slopes, q = slopes[:, kept], span(features[kept], _ROUNDING)
     left = slopes - np.where(np.reshape(learned, (-1, 1, 1)), q @ (q.T @ slopes), 0.0)
     size = np.sqrt(np.mean(slopes**2, axis=(1, 2), keepdims=True))
     slopes, left = (part / np.where(size > 0, size, 1.0) for part in (slopes, left))
@@ -244,16 +245,9 @@ def _are_combinations(
 ) -> Bool[np.ndarray, "k"]:
     """Return a mask of the columns that are linear combinations of features at the same points."""
     kept = np.isfinite(values).all(axis=1) & np.isfinite(features).all(axis=1)
-    values, q = values[kept], _basis(features[kept])
+    values, q = values[kept], span(features[kept], _ROUNDING)
     left = np.linalg.norm(values - q @ (q.T @ values), axis=0)
     return left <= _TOLERANCE * np.linalg.norm(values, axis=0)
-
-
-def _basis(features: Float[np.ndarray, "N nz"]) -> Float[np.ndarray, "N r"]:
-    """Return an orthonormal basis of the span of the features."""
-    size = np.sqrt(np.mean(features**2, axis=0))
-    q, sigma, _ = np.linalg.svd(features / np.where(size > 0, size, 1.0), full_matrices=False)
-    return q[:, sigma > _ROUNDING * sigma.max(initial=0.0)]
 
 
 def _sees(features: Features, lags: Iterable[Lag]) -> bool:
