@@ -189,17 +189,19 @@ CASES = {
 
 
 def motion(rates: dict[str, tuple[str, Any]], outputs: dict[str, str], initial: dict[str, float],
-           inputs: tuple[str, ...], learned: str) -> oa.Motion:  # fmt: skip
-    """Return the equations of an FMU as a motion; `rates` has the derivative and start of each state."""
+           inputs: tuple[str, ...], *learned: str, define: dict[str, str] | None = None,
+           substeps: int = 1) -> oa.Motion:  # fmt: skip
+    """Return the equations of a file as a motion; `rates` has the derivative and start of each state."""
     return oa.Motion.from_equations(
-        [oa.State(name, rate, start, name == learned) for name, (rate, start) in rates.items()],
+        [oa.State(name, rate, start, name in learned) for name, (rate, start) in rates.items()],
         [oa.Output(name, state) for name, state in outputs.items()],
         [
             oa.PhysicalParameter(name, value, min=-np.inf if name == "mu" else 0.0)
             for name, value in initial.items()
         ],
         inputs,
-        substeps=1,
+        define=define,
+        substeps=substeps,
     )
 
 
@@ -227,6 +229,52 @@ EQUATIONS: dict[str, Callable[[], oa.Motion]] = {
         {"J": 0.06, "mgl": 1.2, "d": 0.05},
         ("torque",),
         "speed",
+    ),
+    "MuJoCo, two-link arm": lambda: motion(
+        {
+            "shoulder": ("shoulder_velocity", "shoulder"),
+            "elbow": ("elbow_velocity", "elbow"),
+            "shoulder_velocity": ("(h22*f1 - h12*f2)/det", 0.0),
+            "elbow_velocity": ("(h11*f2 - h12*f1)/det", 0.0),
+        },
+        {"shoulder": "shoulder", "elbow": "elbow"},
+        {"mass": 0.8, "damping": 0.2},
+        ("first", "second"),
+        "shoulder_velocity",
+        "elbow_velocity",
+        define={
+            "h11": "0.205 + mass*(0.36 + 0.0625) + 0.3*mass*cos(elbow)",
+            "h12": "0.02 + 0.0625*mass + 0.15*mass*cos(elbow)",
+            "h22": "0.04 + 0.0625*mass",
+            "det": "h11*h22 - h12*h12",
+            "bend": "0.15*mass*sin(elbow)",
+            "falls": "0.25*9.81*mass*sin(shoulder + elbow)",
+            "f1": "first + bend*(2*shoulder_velocity*elbow_velocity + elbow_velocity**2)"
+            " - (0.45 + 0.6*mass)*9.81*sin(shoulder) - falls - damping*shoulder_velocity",
+            "f2": "3*second - bend*shoulder_velocity**2 - falls - 0.1*elbow_velocity - 0.4*elbow",
+        },
+        substeps=2,
+    ),
+    "MuJoCo, cart and pole": lambda: motion(
+        {
+            "slider": ("slider_velocity", "slider"),
+            "hinge": ("hinge_velocity", "hinge"),
+            "slider_velocity": ("(h22*f1 - h12*f2)/det", 0.0),
+            "hinge_velocity": ("((1 + mass)*f2 - h12*f1)/det", 0.0),
+        },
+        {"slider": "slider", "hinge": "hinge"},
+        {"mass": 0.4, "damping": 0.05},
+        ("push",),
+        "slider_velocity",
+        "hinge_velocity",
+        define={
+            "h12": "0.5*mass*cos(hinge)",
+            "h22": "0.25*mass + 0.04",
+            "det": "(1 + mass)*h22 - h12*h12",
+            "f1": "2*push - 0.3*slider_velocity + 0.5*mass*sin(hinge)*hinge_velocity**2",
+            "f2": "-0.5*9.81*mass*sin(hinge) - damping*hinge_velocity",
+        },
+        substeps=2,
     ),
 }
 """The same physics in a spec's own words: fits are equal to seven digits, and faster."""
