@@ -42,7 +42,7 @@ KEPT = {
     "tests/test_closed_loop.py::test_check_and_fit_name_it",
     "tests/test_compare.py::test_every_structure",
     "tests/test_controller.py::test_a_loop_without_a_delay_is_refused",
-    "tests/test_doubts_of_fits.py::test_a_disturbance_with_memory_is_told_from_missing_physics",
+    "tests/test_doubts_of_fits.py::test_a_disturbance_with_memory_is_distinguished_from_missing_physics",
     "tests/test_examination.py::test_a_fit_in_python_is_judged_as_the_command_judges_it[lagged_suspects]",
     "tests/test_examination.py::test_a_fit_in_python_is_judged_as_the_command_judges_it[motion_physics]",
     "tests/test_explain.py::test_the_physics_with_the_term_leaves_the_learner_nothing",

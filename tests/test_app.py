@@ -558,7 +558,7 @@ def test_a_part_of_the_page_that_fails_keeps_no_other_from_what_is_new(tmp_path,
     assert len(found) == 1
 
 
-def test_a_process_that_cannot_start_is_told(tmp_path, monkeypatch):
+def test_a_process_that_cannot_start_is_reported(tmp_path, monkeypatch):
     async def refused():
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
@@ -741,7 +741,7 @@ def test_a_file_that_is_dropped_again_begins_a_spec_that_nobody_worked_on_anew(s
     asyncio.run(worked())
 
 
-def test_a_spec_tells_its_files_and_columns():
+def test_a_spec_says_its_files_and_columns():
     content = tomllib.loads(SPEC + '[structure]\nmeasure = { kind = "file", files = ["m.csv"] }\n')
     assert spec_text.files(content) == ["run.csv", "/there/b.csv", "../c.csv", "m.csv"]
     content["data"]["channels"] = {"u": {"column": "Force (N)"}, "y": {"unit": "m"}}
@@ -1402,7 +1402,7 @@ def test_the_whole_path_by_keyboard_alone(server, browser, csv, tmp_path):
 
 
 @browsed
-def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
+def test_what_is_wrong_is_reported_on_the_page(server, browser, csv, tmp_path):
     tab = Tab(browser, server)
     page = tab.page
     page.get_by_label("or its path").fill(str(tmp_path / "absent.csv"))
@@ -1468,7 +1468,7 @@ def test_what_is_wrong_is_told_on_the_page(server, browser, csv, tmp_path):
 
 
 @browsed
-def test_a_wrong_sampling_time_is_told_under_it_and_takes_nothing_away(
+def test_a_wrong_sampling_time_is_reported_under_it_and_takes_nothing_away(
     server, browser, csv, tmp_path
 ):
     tab = Tab(browser, server)

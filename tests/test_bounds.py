@@ -340,7 +340,7 @@ def test_a_bound_leaves_the_others_as_a_fixed_term_does(ny, criterion):
     assert not any(warning.code == "no_standard_errors" for warning in found.warnings)
 
 
-def test_what_the_learner_could_imitate_is_told_of_the_others():
+def test_what_the_learner_could_imitate_is_reported_for_the_others():
     given, baseline, learner = heated()
     fit = estimate(given, baseline, learner=learner, **OPTIONS)
     found = imitation(fit.problem, others=False, held=tuple(fit.at_bound))

@@ -205,7 +205,7 @@ def test_theta_without_physical_parameters_gives_bounds_or_no_interval():
 
 
 @pytest.mark.parametrize("missing", ["coulomb", "tanh", "cubic", "drag"])
-def test_what_is_missing_of_a_speed_is_named_or_told_with_what_explains_as_much(missing):
+def test_what_is_missing_of_a_speed_is_named_or_reported_with_what_explains_as_much(missing):
     """One lag: friction, friction that turns round slowly as a saturation does, and hardening, each as what it is."""
     form = {
         "coulomb": lambda v: 0.05 * np.sign(v),
@@ -262,7 +262,7 @@ def test_a_level_about_zero_has_no_root():
     assert "cubic of y[k-1]" in names and not any("square_root" in name for name in names)
 
 
-def test_a_cause_that_is_not_sure_is_told_with_those_close_to_it():
+def test_a_cause_that_is_not_sure_is_reported_with_those_close_to_it():
     fit = tank(zone=5.0)
     found = bias_budget(fit)
     assert found is not None and found.share < SURE_SHARE

@@ -145,7 +145,7 @@ def test_where_nothing_is_missing_no_change_is_named(criterion):
     assert changes_of(fitted(criterion, **noise)) == ()
 
 
-def test_the_output_that_lacks_a_term_is_told():
+def test_the_output_that_lacks_a_term_is_reported():
     rng = np.random.default_rng(4)
     u, y = rng.normal(size=(900, 2)), np.zeros((900, 2))
     for k in range(2, 900):
@@ -172,7 +172,7 @@ def test_long_records_are_looked_at_in_stretches():
     assert changes_of(fit)[0].what == "u[k-3]"
 
 
-def test_what_could_be_predicted_is_told_per_output():
+def test_what_could_be_predicted_is_reported_per_output():
     fit = fitted(further=0.2, noise=0.1, sensor=0.0)
     (one,) = predictable(fit.problem, fit.model.predict(fit.problem.record))
     assert one.name == "y" and one.rms == pytest.approx(

@@ -371,7 +371,7 @@ def test_a_suspect_is_named_once_in_its_error(project):
     assert run("check", project).err.count("suspect 'cubic(position[k-7])'") == 1
 
 
-def test_a_suspect_without_effect_is_told_of(project):
+def test_a_suspect_without_effect_is_reported(project):
     """Zero on all rows: it biases nothing here, but it must not vanish from the answer."""
     report = result_of(
         project, MACHINE + suspects('on = "0*force[k-1]"', 'kind = "offset"'), "check"

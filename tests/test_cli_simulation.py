@@ -157,7 +157,7 @@ def test_physics_alone_on_the_free_run(tmp_path):
         assert abs(parameter["value"] - truth) < 4 * parameter["std"]
 
 
-def test_one_step_with_sensor_noise_is_told(tmp_path):
+def test_one_step_with_sensor_noise_is_reported(tmp_path):
     spec = project(tmp_path / "p", ALONE, QUICK, **system(0, 600, sensor=0.3))
     printed, result = printed_fit(spec)
     assert result["residuals"]["verdict"] == "sensor_noise"
@@ -323,7 +323,7 @@ def test_a_learner_that_finds_the_square_helps(tmp_path):
 @pytest.mark.parametrize(
     "blocks", ["", "[validation]\nblocks = 40\n"], ids=["few rows", "many blocks"]
 )
-def test_a_record_too_short_for_blocks_is_told(tmp_path, blocks):
+def test_a_record_too_short_for_blocks_is_reported(tmp_path, blocks):
     """No verdict, and a sentence that says why."""
     rows, learner = (300, SMALL) if blocks else (60, GREEDY)
     result = fit(

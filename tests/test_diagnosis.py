@@ -312,7 +312,7 @@ def test_the_text_names_the_regressor_over_which_the_residual_is_curved():
     assert "depends nonlinearly on y[k-1]" in found.text
 
 
-def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
+def test_an_unmodelled_residual_is_reported_with_its_size_and_advice():
     found = of(second_order(0, equation=0.1, missing="lag of u"))
     share = (
         100
@@ -327,7 +327,7 @@ def test_an_unmodelled_residual_is_told_with_its_size_and_advice():
     assert "coloured" in dict(found.warnings)["inconsistent"]
 
 
-def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_told():
+def test_a_coloured_disturbance_biases_the_one_step_parameters_and_is_reported():
     """The physics is complete; y_{k−1} holds what the disturbance e_{k−1} tells of e_k."""
     rng = np.random.default_rng(5)
     u, e, y = np.repeat(rng.normal(size=500), 4), np.zeros(2000), np.zeros(2000)
@@ -449,7 +449,7 @@ def test_responses_that_exist_are_not_computed_again(monkeypatch):
     assert told(diagnose(fit, **responses)) == plain
 
 
-def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
+def test_one_step_with_sensor_noise_is_a_warning_that_names_the_criterion():
     found = of(second_order(0, sensor=0.3))
     (warning,) = found.warnings
     assert warning.code == "sensor_noise" and "intervals do not cover" in warning.text
@@ -458,7 +458,7 @@ def test_one_step_with_sensor_noise_is_warned_and_told_the_criterion():
 
 
 @pytest.mark.parametrize(("step", "told"), [(0.3, True), (0.02, False), (None, False)])
-def test_steps_of_an_output_are_told_where_the_one_step_error_has_their_size(step, told):
+def test_steps_of_an_output_are_reported_where_the_one_step_error_has_their_size(step, told):
     """Slow motion in coarse steps, as an encoder tells it; finer ones than the noise are no cause."""
     rng = np.random.default_rng(4)
     u, y = np.repeat(rng.normal(size=60), 30), np.zeros(1800)
@@ -477,7 +477,7 @@ def test_steps_of_an_output_are_told_where_the_one_step_error_has_their_size(ste
         assert found.steps == {"y": pytest.approx(0.3)} and "a finer measurement" in found.text
 
 
-def test_sampling_too_fast_is_told():
+def test_sampling_too_fast_is_reported():
     found = of(spring(10000, 0))
     assert found.noise_in_lags > 0.2 and "too fast for one-step estimation" in found.text
 
@@ -516,7 +516,7 @@ def test_trained_on_the_free_run_what_is_missing_is_no_sensor_noise(missing):
     )
 
 
-def test_a_free_run_trained_on_equation_noise_is_told_of_the_one_step_criterion():
+def test_a_free_run_trained_on_equation_noise_names_the_one_step_criterion():
     found = of(second_order(1, equation=0.1), criterion=Simulation(0, 40))
     assert (
         found.verdict == "equation_noise"
@@ -628,7 +628,7 @@ def test_no_input():
     )
 
 
-def test_shares_are_told_of_the_output_that_follows_something():
+def test_shares_are_reported_of_the_output_that_follows_something():
     """Of two outputs of which nothing could be predicted, the one whose residual tests reject."""
 
     def test_of(name, followed):

@@ -189,14 +189,14 @@ def test_every_name_of_the_code_is_a_word_of_the_code(page):
     assert {name for name in named if name not in words()} == set()
 
 
-def test_every_numbered_fact_is_told():
+def test_every_numbered_fact_is_reported():
     names = re.findall(r"^\| (F\d+) \|", TEXTS["docs/guide/theory.md"], re.MULTILINE)
     texts = [*TEXTS.values(), *(file.read_text(encoding="utf-8") for file in SOURCE.rglob("*.py"))]
     named = set(re.findall(r"[(\s](F\d{1,2})[),:.\s]", " ".join(texts)))
     assert names == [f"F{i + 1}" for i in range(12)] and named - set(names) == set()
 
 
-def test_the_rooms_are_told_in_their_order():
+def test_the_rooms_are_reported_in_their_order():
     names = tuple(re.findall(r"^\| `(\w+)` \|", TEXTS["CONTRIBUTING.md"], re.MULTILINE))
     assert names == ROOMS
     assert " ← ".join(f"`{room}`" for room in ROOMS) in TEXTS["docs/decisions/rooms.md"]
@@ -244,7 +244,7 @@ def told(thing: type | object) -> str:
     return "\n".join([inspect.getdoc(thing) or "", *fields, *makers, *bases])
 
 
-def test_every_argument_of_a_function_and_of_a_declaration_is_told():
+def test_every_argument_of_a_function_and_of_a_declaration_is_reported():
     known = {"name", "resident"}  # what the name says, and what only the engines' own code gives
     untold = {}
     for name in orthaug.__all__:

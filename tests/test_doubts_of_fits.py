@@ -219,7 +219,7 @@ def second_order(disturbance, **options):
     return oa.estimate(record, terms, learner=None, **options).diagnose()
 
 
-def test_a_disturbance_with_memory_is_told_from_missing_physics():
+def test_a_disturbance_with_memory_is_distinguished_from_missing_physics():
     """Nothing but its own past predicts it: a noise model is the remedy, not a further term."""
     rng = np.random.default_rng(5)
     noise = np.zeros(1500)
@@ -236,7 +236,7 @@ def test_a_disturbance_with_memory_is_told_from_missing_physics():
 
 @pytest.mark.parametrize("iterations", [1, 100])
 @pytest.mark.parametrize("physics", ["complete", "lacking"])
-def test_what_intervals_count_is_told_only_where_there_are_some(iterations, physics):
+def test_what_intervals_count_is_reported_only_where_there_are_some(iterations, physics):
     rng, noise = np.random.default_rng(5), np.zeros(1500)
     for k in range(1, 1500):
         noise[k] = 0.8 * noise[k - 1] + 0.05 * rng.normal()

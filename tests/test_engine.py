@@ -282,7 +282,7 @@ def test_adam_needs_rows_in_memory():
         fit(posed(1), engine=Streaming(), **options)
 
 
-def test_progress_is_told_as_a_mean_square():
+def test_progress_is_reported_as_a_mean_square():
     entries = []
     options = {
         "learner": MLP(hidden=(3,)),

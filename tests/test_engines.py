@@ -625,7 +625,7 @@ def test_files_for_clusters_say_what_the_program_takes(folder, monkeypatch):
     )
 
 
-def test_no_cluster_in_reach_is_told(folder, monkeypatch):
+def test_no_cluster_in_reach_is_reported(folder, monkeypatch):
     monkeypatch.setattr("orthaug.models.cluster._PATIENCE", "1 s")
     with pytest.raises(oa.InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9 "):
         fitted(folder, "dask", more='scheduler = "tcp://127.0.0.1:9"')

@@ -406,7 +406,7 @@ def test_warm_start_with_other_physics(record, short):
     assert found.model.form.features == short.model.form.features
 
 
-def test_progress_is_told(record):
+def test_progress_is_reported(record):
     entries = []
     solver = LevenbergMarquardt(iterations=6)
     found = estimate(
@@ -473,7 +473,7 @@ def test_a_learner_that_was_regularised_to_nothing_says_so():
 @pytest.mark.parametrize(
     "solver", [LevenbergMarquardt(iterations=60), AdamLBFGS(40, 40)], ids=["lm", "paper"]
 )
-def test_who_is_told_can_say_that_it_is_enough(record, solver):
+def test_who_was_warned_can_say_that_it_is_enough(record, solver):
     def enough(run, iteration, loss):
         raise StopTraining
 

@@ -131,7 +131,7 @@ def test_a_function_from_another_toolbox_is_explained_as_it_is():
     assert [moved.value_with for moved in found.parameters] == pytest.approx(list(TRUE.values()))
 
 
-def test_an_expression_with_commas_is_told_as_it_is_written():
+def test_an_expression_with_commas_is_reported_as_it_is_written():
     given = fitted(-0.3, learner=None).problem
     plant = lambda x: (x @ [0.6, -0.2, 1.0] + x[:, 2] - np.clip(x[:, 2], -0.4, 0.4))[:, None]  # noqa: E731
     found = oa.explain(oa.orthogonalize(given.record, given.baseline, plant))
@@ -338,7 +338,7 @@ def project(tmp_path_factory):
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_the_command_tells_what_to_write_and_that_can_be_read(project):
+def test_the_command_says_what_to_write_and_that_can_be_read(project):
     done = run("explain", project / "plant", project / "run.csv", "--json")
     result = json.loads(done.out)
     assert done.code == 0 and result["found"] and result["terms"][0]["expression"] == "y[k-1]**3"
@@ -365,9 +365,7 @@ def test_the_command_tells_what_to_write_and_that_can_be_read(project):
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_where_the_spec_has_a_map_to_physical_parameters_the_lines_for_it_are_told(
-    project, tmp_path
-):
+def test_where_the_spec_has_a_map_to_physical_parameters_its_lines_are_given(project, tmp_path):
     names = ("a", "b", "g")
     own = "[physics.parameters]\n" + "".join(f"p{name} = {{ initial = 1.0 }}\n" for name in names)
     own += "cubic = { initial = -0.2 }\n[physics.theta]\n" + "".join(
@@ -466,7 +464,7 @@ def test_explain_leaves_out_missing_cells_or_refuses_them(project, tmp_path):
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_wrong_use_is_told_in_a_line(project):
+def test_wrong_use_is_reported_in_a_line(project):
     refused = run("explain", project / "alone", project / "run.csv")
     assert refused.code == 2 and one_line(
         refused.err, f"{project / 'alone'}: the model is physics alone"

@@ -24,7 +24,7 @@ def test_alone_there_is_nothing_to_join():
         ),
     ],
 )
-def test_what_is_wrong_with_the_environment_is_told(monkeypatch, environment, told):
+def test_what_is_wrong_with_the_environment_is_reported(monkeypatch, environment, told):
     monkeypatch.setattr(hosts, "_PATIENCE", 0.1)
     with pytest.raises(oa.InputError, match=told):
         hosts.join({"ORTHAUG_COORDINATOR": "127.0.0.1:9"} | environment)

@@ -83,7 +83,7 @@ def test_the_rule_does_not_depend_on_the_unit_of_the_output(tmp_path, text, scal
 
 @pytest.mark.parametrize("command", ["check", "fit"])
 @pytest.mark.parametrize("text", [LAGGED, MOTION], ids=["lagged", "motion"])
-def test_inputs_that_noise_tells_apart_are_no_finding(tmp_path, command, text):
+def test_inputs_that_noise_distinguishes_are_no_finding(tmp_path, command, text):
     assert told(tmp_path, command, text, 0.03) == []
 
 

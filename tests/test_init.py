@@ -324,7 +324,7 @@ def test_an_output_without_inputs_and_level_gets_its_own_past(tmp_path):
     )
 
 
-def test_columns_of_one_name_are_told_apart(tmp_path, monkeypatch):
+def test_columns_of_one_name_are_distinguished(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     u, y = plant(300)
     rows = "".join(f"{a},{b},{c}\n" for a, b, c in zip(u, y, np.roll(u, 7), strict=True))
@@ -371,7 +371,7 @@ def test_a_proposal_respects_what_was_given_and_is_never_empty(
     assert done.code == 2 and message in " ".join(done.err.split()), done.err
 
 
-def test_an_encoding_that_was_guessed_is_told(tmp_path):
+def test_an_encoding_that_was_guessed_is_reported(tmp_path):
     u, y = plant(300)
     rows = "".join(f"{a},{b}\n" for a, b in zip(u, y, strict=True))
     (tmp_path / "a.csv").write_bytes(("u,y [µm]\n" + rows).encode("cp1252"))
@@ -389,7 +389,7 @@ def test_an_encoding_that_was_guessed_is_told(tmp_path):
     assert warnings[0] == f"train: {warning}"
 
 
-def test_a_damaged_byte_in_a_column_that_is_not_used_is_told_with_its_line(tmp_path):
+def test_a_damaged_byte_in_a_column_that_is_not_used_is_reported_with_its_line(tmp_path):
     """Found by the fuzzer (.tsv, seed 110): the file was read as Windows-1252 without a word."""
     u, y = plant(300)
     rows = "".join(f"{a},{b},n{i}\n" for i, (a, b) in enumerate(zip(u, y, strict=True))).encode()
@@ -509,7 +509,7 @@ def test_dates_are_the_clock(tmp_path):
         assert load_spec(tmp_path / "spec.toml").train.record.sampling_time == pytest.approx(0.02)
 
 
-def test_uneven_milliseconds_are_resampled_and_their_steps_told(tmp_path):
+def test_uneven_milliseconds_are_resampled_and_their_steps_reported(tmp_path):
     u, y = plant(300)
     t = 20.0 * np.arange(300.0)
     t[1::2] += 3.0
@@ -553,7 +553,7 @@ STEPS = [
 
 
 @pytest.mark.parametrize(("header", "every", "given", "told"), STEPS)
-def test_a_column_that_tells_another_step_is_a_warning(tmp_path, header, every, given, told):
+def test_a_column_that_says_another_step_is_a_warning(tmp_path, header, every, given, told):
     u, y = plant(100)
     pd.DataFrame({header: every * np.arange(100), "u": u, "y": y}).to_csv(
         tmp_path / "a.csv", index=False
@@ -668,7 +668,7 @@ def test_a_single_number_in_a_file_of_matlab_is_the_sampling_time(tmp_path, besi
     assert survey(tmp_path / "a.npz").clock.step == (step if beside else None)
 
 
-def test_a_lag_that_is_a_guess_is_told_in_the_spec(tmp_path):
+def test_a_lag_that_is_a_guess_is_reported_in_the_spec(tmp_path):
     rng = np.random.default_rng(0)
     pd.DataFrame({"u": rng.normal(size=30), "y": rng.normal(size=30)}).to_csv(
         tmp_path / "a.csv", index=False

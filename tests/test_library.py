@@ -142,7 +142,7 @@ def test_what_cannot_be_opened_or_written(job, tmp_path):
         (0.3, 0.0, "helps", "no suspect explains half of what the learner found"),
     ],
 )
-def test_what_a_learner_may_have_taken_is_told_where_no_cause_is_known(
+def test_what_a_learner_may_have_taken_is_reported_where_no_cause_is_known(
     tmp_path, wave, noise, verdict, told
 ):
     u = np.random.default_rng(0).uniform(-1, 1, 900)

@@ -212,7 +212,7 @@ def test_derivatives_are_those_of_finite_differences(cubic):
         assert view.system.modes.moved[0][j] == pytest.approx(pole, rel=1e-4, abs=1e-9)
 
 
-def test_all_equilibria_are_found_and_told(cubic):
+def test_all_equilibria_are_found_and_reported(cubic):
     found = oa.linearize(cubic.model)
     rests = sorted(view.point.values["y"] for view in found)
     a, c = (
@@ -472,7 +472,7 @@ def test_the_damping_of_a_motion_with_steep_friction_is_that_of_small_movements_
     assert not oa.linearize(mild, "u = 0")[0].warnings
 
 
-def test_without_a_joint_covariance_the_learner_is_frozen_or_nothing_is_told(linear, cubic):
+def test_without_a_joint_covariance_the_learner_is_frozen_or_nothing_is_reported(linear, cubic):
     ensemble = replace(cubic, model=replace(cubic.model, statistics=type(cubic.model.statistics)()))
     frozen = oa.linearize(ensemble, "y = 0")
     assert [warning.code for warning in frozen.warnings] == ["learner_frozen"] and frozen[

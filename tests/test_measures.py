@@ -283,7 +283,7 @@ def test_the_data_support_a_box_beyond_them_in_part():
     assert even.share(Uniform({"u[k]": (-0.9, 0.9)}).points(even)) == pytest.approx(1, abs=1e-12)
 
 
-def test_support_is_told_of_the_mirror_images_of_data_on_one_side():
+def test_support_is_reported_of_the_mirror_images_of_data_on_one_side():
     given = support(u=np.abs(U) + 1)
     assert given.share(Symmetrized().points(given)) == pytest.approx(0.5)
 

@@ -229,7 +229,7 @@ def test_a_fit_finds_mass_and_stiffness_beside_the_friction(result):
     )  # the nearest viscous friction has a share of Coulomb's
 
 
-def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_told_where_no_suspect_is_declared(
+def test_what_a_learner_that_helps_may_hold_of_a_parameter_is_reported_where_no_suspect_is_declared(
     printed, result
 ):
     rows = {row["name"]: row for row in result["parameters"]}
@@ -583,7 +583,7 @@ def test_compare_puts_physics_alone_and_saved_models_beside(folder, printed, res
     )
 
 
-def test_check_tells_what_cannot_be_told_apart_and_which_hold_is_right(tmp_path):
+def test_check_says_what_cannot_be_distinguished_and_which_hold_is_right(tmp_path):
     """A sensor gain scales mass, damper and spring; the input runs straight between samples."""
     text = SPEC.replace('position = "x"', 'position = "g*x"').replace(
         "[learner]", "g = { initial = 1.1, min = 0 }\n[motion]\nsubsteps = 1\n[learner]"

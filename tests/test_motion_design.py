@@ -103,7 +103,7 @@ def test_what_cannot_be_designed_is_refused() -> None:
         designed(parameters=[1.0, 0.8, 1e6])  # too fast for two substeps
 
 
-def test_an_input_that_is_known_tells_its_own_gain() -> None:
+def test_an_input_that_is_known_says_its_own_gain() -> None:
     """Held at zero it tells nothing of it."""
     states = [oa.State("x", "(b*u + g*w - x)/T")]
     values = [oa.PhysicalParameter(name, 1.0) for name in ("T", "b", "g")]

@@ -130,7 +130,7 @@ def test_a_linear_motion_is_the_output_error_fit_of_the_lagged_form(record_prope
     assert np.poly(poles) == pytest.approx([1, *-theirs.theta[:2]], rel=1e-6)
 
 
-def test_mass_and_stiffness_are_told_from_a_learner_of_the_velocity(
+def test_mass_and_stiffness_are_distinguished_from_a_learner_of_the_velocity(
     fitted: oa.MotionEstimate,
 ) -> None:
     table = fitted.parameters
@@ -286,7 +286,7 @@ def test_where_the_learner_does_not_help_the_result_is_physics_alone() -> None:
     assert "physics_alone" in [warning.code for warning in fit.warnings]
 
 
-def test_what_no_output_tells_has_no_interval() -> None:
+def test_what_no_output_says_has_no_interval() -> None:
     """Only the product b·g enters: a gain before a hidden state and one after it."""
     rng = np.random.default_rng(0)
     u, x, y = rng.normal(size=150), 0.0, []
@@ -459,7 +459,7 @@ def test_a_model_runs_on_other_records(fitted: oa.MotionEstimate) -> None:
     assert list(frame) == ["time", "x", "v", "v_physics", "v_learner"] and len(frame) == len(record)
 
 
-def test_white_errors_are_told_from_coloured_ones_and_make_robust_errors(
+def test_white_errors_are_distinguished_from_coloured_ones_and_make_robust_errors(
     fitted: oa.MotionEstimate,
 ) -> None:
     found = oa.diagnose(fitted)
@@ -530,7 +530,7 @@ def test_an_input_that_acts_through_a_lag_is_named_with_its_time_constant() -> N
 @pytest.mark.parametrize(
     ("own", "words"), [(0.0, "too little to predict it from its"), (0.2, "and 20 % of it follows")]
 )
-def test_what_is_called_coloured_is_told_with_its_correlation(own: float, words: str) -> None:
+def test_what_is_called_coloured_is_reported_with_its_correlation(own: float, words: str) -> None:
     """A slight colour is surely there in many rows, and yet the past predicts nothing."""
     e = np.random.default_rng(2).normal(size=(4000, 2))
     e[1:, 0] += 0.2 * e[:-1, 0]
@@ -554,7 +554,7 @@ def test_several_experiments_are_diagnosed_as_one_is() -> None:
     assert found is not None and found.verdict == "unmodelled"
 
 
-def test_traces_that_tests_see_beside_the_noise_are_told() -> None:
+def test_traces_that_tests_see_beside_the_noise_are_reported() -> None:
     random = np.random.default_rng(3)
     e, u, x = (
         random.normal(size=(4000, 2)),

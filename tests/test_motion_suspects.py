@@ -85,7 +85,7 @@ def learned() -> oa.MotionEstimate:
     )
 
 
-def test_physics_alone_is_biased_as_the_term_says_and_the_residual_tells_its_size(
+def test_physics_alone_is_biased_as_the_term_says_and_the_residual_says_its_size(
     alone: oa.MotionEstimate,
 ) -> None:
     friction, hardening = oa.suspected_bias(alone, SUSPECTS)
@@ -153,7 +153,7 @@ def test_a_term_that_the_learner_sees_moves_what_it_could_imitate_alone(
     assert hardening.explained < 0.1
 
 
-def test_explain_tells_the_parameters_with_the_term_in_the_physics(
+def test_explain_says_the_parameters_with_the_term_in_the_physics(
     learned: oa.MotionEstimate,
 ) -> None:
     """c is fitted as a logarithm: a step of that as long as the bias would end at 0.83."""
@@ -544,7 +544,7 @@ def test_terms_of_each_equation_are_chosen_beside_those_of_the_others(
     assert one_of_each(ground, alone) == []
 
 
-def test_the_size_of_a_cause_is_that_of_what_tells_of_it(
+def test_the_size_of_a_cause_is_that_of_its_trace(
     alone: oa.MotionEstimate, learned: oa.MotionEstimate
 ) -> None:
     """Of a learner by what it found, also where the residual tells of the term; without a learner by the residual."""

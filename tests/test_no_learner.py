@@ -104,7 +104,7 @@ def test_a_model_whose_learner_is_taken_away_is_saved_and_read(tmp_path) -> None
         np.testing.assert_array_equal(ours.model, saved.model)
 
 
-def test_physics_alone_is_not_told_to_be_no_better_than_a_learner() -> None:
+def test_physics_alone_is_not_reported_to_be_no_better_than_a_learner() -> None:
     record, motion = moving(learned=False)
     options = {"learner": None, "criterion": oa.Simulation(), "validation": record}
     fit = oa.estimate(record, motion, **options)

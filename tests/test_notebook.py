@@ -175,7 +175,7 @@ def test_the_overview_has_run_residual_parameters_and_learned_part(fit, record):
         oa.plot(fit, "output")
 
 
-def test_the_fit_of_a_spec_shows_what_its_result_tells(fit):
+def test_the_fit_of_a_spec_shows_what_its_result_says(fit):
     row = ParameterResult(
         **{
             "name": "m",

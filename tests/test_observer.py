@@ -191,7 +191,7 @@ def test_the_table_has_bands(make=nonlinear_motion):
     assert table["time"][3] == pytest.approx(0.3)
 
 
-def test_wrong_noises_are_told():
+def test_wrong_noises_are_reported():
     model, noise = nonlinear_lagged()
     measured, _, _, u = simulated(model, noise, 1000, seed=2)
     found = oa.Observer(model, oa.Noise(0.3 * noise.state, 0.3 * noise.output)).run(
@@ -317,7 +317,7 @@ def system(q, r, seed=0, rows=1500):
     [(0.1, 0.0, oa.Prediction()), (0.0, 0.3, oa.Simulation()), (0.1, 0.3, oa.Simulation())],
     ids=["equation", "sensor", "both"],
 )
-def test_the_residual_tells_where_the_noise_enters(q, r, criterion):
+def test_the_residual_says_where_the_noise_enters(q, r, criterion):
     fit = oa.estimate(system(q, r), PHYSICS, learner=None, criterion=criterion)
     noise = oa.Observer(fit).noise
     assert noise.state[0, 0] == pytest.approx(q**2, rel=0.15, abs=5e-3 * r**2)
@@ -372,7 +372,7 @@ def test_a_fit_keeps_noises_by_the_likelihood_of_its_data(tmp_path):
 # --- what is refused
 
 
-def test_what_it_cannot_observe_is_told():
+def test_what_it_cannot_observe_is_reported():
     model, noise = nonlinear_lagged()
     with pytest.raises(
         oa.InputError, match="no estimate of its noise .*; give the observer `noise=`"
@@ -399,7 +399,7 @@ def test_what_it_cannot_observe_is_told():
             oa.Observer(model, given)
 
 
-def test_what_is_no_sample_is_told():
+def test_what_is_no_sample_is_reported():
     model, noise = nonlinear_lagged()
     record = record_of(model, np.zeros(20), np.zeros(20))
     observer = oa.Observer(model, noise)
@@ -422,7 +422,7 @@ def test_what_is_no_sample_is_told():
         observer.run(record.rows(0, 2))
 
 
-def test_an_estimate_without_bounds_is_told():
+def test_an_estimate_without_bounds_is_reported():
     terms = [oa.Term("a", "y[k-1]**3"), oa.Term("g", "u[k-1]")]
     model = lagged(terms, (), None, ("y",), ("u",))
     model = replace(
@@ -572,7 +572,7 @@ def test_rows_and_columns_are_chosen_as_in_a_spec(fitted):
     ],
     ids=str,
 )
-def test_wrong_options_are_told(fitted, options, words, tmp_path):
+def test_wrong_options_are_reported(fitted, options, words, tmp_path):
     done = run(
         "predict", fitted / "out", fitted / "run.csv", *options, "--out", tmp_path / "out.csv"
     )
@@ -616,7 +616,7 @@ def test_the_band_of_an_observer_that_takes_coloured_errors_for_white_says_so(tm
     assert f"as one of 95 %: {wanted}. Predictions without --observer use the noise" in done.err
 
 
-def test_a_prediction_tells_whether_its_band_is_one_of_95_percent(fitted, tmp_path):
+def test_a_prediction_says_whether_its_band_is_one_of_95_percent(fitted, tmp_path):
     done = run(
         "predict",
         fitted / "out",

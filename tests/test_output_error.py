@@ -134,7 +134,7 @@ def test_rosenbrock():
     assert found.code == "converged" and found.iterations < 60
 
 
-def test_the_limit_of_iterations_is_told():
+def test_the_limit_of_iterations_is_reported():
     found = run(rosenbrock(), [-1.2, 1.0], iterations=3)
     assert found.code == "iteration_limit" and found.iterations == 3
     assert found.loss < rosenbrock().loss(np.array([-1.2, 1.0]))

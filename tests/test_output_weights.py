@@ -247,7 +247,7 @@ def test_the_free_run_takes_them_too():
     assert np.abs(thetas[2] - thetas[1]).max() > 1e-4  # by the covariance of the errors
 
 
-def test_turns_that_do_not_settle_are_told():
+def test_turns_that_do_not_settle_are_reported():
     first, second = (estimate(two_outputs(unit), BASELINE, learner=None) for unit in (20.0, 30.0))
     last = reweight(first, lambda problem, before: second if before is first else first)
     assert [w.code for w in last.warnings] == ["output_weights_unsettled"]

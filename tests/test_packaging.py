@@ -111,7 +111,7 @@ def test_the_container_copies_what_is_there():
     assert {"pyproject.toml", "src"} <= set(names) and all((ROOT / name).exists() for name in names)
 
 
-def test_the_wheel_carries_what_tells_of_every_key():
+def test_the_wheel_carries_the_text_of_every_key():
     wheel = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["force-include"] == {"docs/spec.md": "orthaug/commands/spec.md"}
     found = [
@@ -125,7 +125,7 @@ def test_the_wheel_carries_what_tells_of_every_key():
 
 
 @pytest.mark.parametrize("page", ["docs/start.md", "docs/install.md"])
-def test_every_extra_is_told(page):
+def test_every_extra_is_reported(page):
     extras = set(PROJECT["project"]["optional-dependencies"]) - {"dev"}
     names = set(
         re.findall(

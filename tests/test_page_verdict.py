@@ -180,7 +180,7 @@ def test_what_was_tried_comes_first_and_what_was_not_is_an_option():
     )
 
 
-def test_physics_alone_that_was_taken_for_a_learner_is_not_told_to_be_hurt_by_it():
+def test_physics_alone_that_was_taken_for_a_learner_is_not_reported_to_be_hurt_by_it():
     fell_back = [Warning(code="physics_alone", text="")]
     assert fit_verdict(fitted(validation=judged("hurts"))).level == "bad"
     found = fit_verdict(fitted(validation=judged("hurts"), warnings=fell_back))

@@ -229,7 +229,7 @@ def test_sensitivity_of_a_parameter_that_is_zero_does_not_exist():
     np.testing.assert_allclose(found.sensitivities[1], [0, 1], atol=1e-14)
 
 
-def test_two_solutions_are_told():
+def test_two_solutions_are_reported():
     found = solve(one("(m - 2)**2", initial=3.5), np.array([1.0]), None, freedom=10)
     np.testing.assert_allclose(found.value, [3.0], rtol=1e-12)
     assert texts(found)[0] == (

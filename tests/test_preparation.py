@@ -231,7 +231,7 @@ def test_what_cannot_be_done_is_said(call, message):
         call()
 
 
-def test_what_a_filter_does_to_theta_is_told():
+def test_what_a_filter_does_to_theta_is_reported():
     def codes(*steps):
         return [w.code for w in warnings_of(oa.prepare(record(SLOW), *steps).prepared, ["u", "y"])]
 
@@ -260,7 +260,7 @@ def test_the_free_run_is_advised_only_where_it_was_not_trained_on(tmp_path, focu
         assert "Compare with a fit to the data as they are" in warnings
 
 
-def test_a_spec_prepares_every_part_and_the_result_tells(tmp_path, monkeypatch):
+def test_a_spec_prepares_every_part_and_the_result_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = make_project(tmp_path)
     text, steps = (
@@ -389,7 +389,7 @@ def test_a_shift_is_a_part_of_the_model_and_done_without_a_word(tmp_path, monkey
     assert len(pd.read_csv("b.csv")) == 200 and len(free) == 198
 
 
-def test_code_tells_what_its_signals_stand_for(decimated, monkeypatch):
+def test_code_says_what_its_signals_stand_for(decimated, monkeypatch):
     monkeypatch.chdir(decimated)
     assert run("export", "result", "--to", "c", "--out", "code").code == 0
     for file in ("README.md", "model.h"):

@@ -174,7 +174,7 @@ def test_along_directions_that_the_rows_tell_phi_may_have_columns_of_zeros():
     assert not projection.solve_along(v, np.eye(5)[:, 3:]).any()
 
 
-def test_directions_that_differ_in_what_no_row_tells_are_one():
+def test_directions_that_differ_in_what_no_row_says_are_one():
     phi = np.zeros((20, 1, 3))
     phi[:, 0, :2] = np.random.default_rng(1).normal(size=(20, 2))
     projection, basis = Projection.factor(phi), np.array([[1.0, 1.0], [0.5, 0.5], [0.0, 7.0]])

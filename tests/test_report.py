@@ -161,7 +161,7 @@ def test_a_page_is_one_file_that_asks_nothing_of_a_network(pages, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_plot_is_told_in_words_and_every_caption_is_a_sentence(pages, kind):
+def test_every_plot_is_reported_in_words_and_every_caption_is_a_sentence(pages, kind):
     page = Read(pages[kind])
     plots = [attrs for _, attrs, _ in page.found if "data-figure" in attrs]
     assert [int(plot["data-figure"]) for plot in plots] == list(
@@ -204,7 +204,7 @@ def test_physics_alone_is_the_model_without_its_learner(lagged, motion, pages):
         assert values(drawn)[2:] == pytest.approx(alone[2:], rel=1e-5, abs=1e-6)
 
 
-def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
+def test_a_page_says_how_its_result_was_made(lagged, pages, monkeypatch):
     page, origin = Read(pages["lagged"]), origin_of(lagged.job, "fit")
     assert lagged.job.path.read_text().strip() in page.text("pre")[-1]
     cells = page.text("td")
@@ -224,7 +224,7 @@ def test_a_page_tells_how_its_result_was_made(lagged, pages, monkeypatch):
             check_folder(lagged.job.path.parent / "not yet there")
 
 
-def test_a_spec_that_was_changed_meanwhile_is_told_as_it_was_read(lagged):
+def test_a_spec_that_was_changed_meanwhile_is_reported_as_it_was_read(lagged):
     path = lagged.job.path
     written = path.read_text()
     for changed in (written.replace("restarts = 3", "restarts = 4"), "not TOML"):
@@ -289,7 +289,7 @@ def test_a_surface_stands_where_data_are_near_and_sees_the_learner(lagged, pages
     assert np.isfinite(there).any() and np.isnan(there).any() and heat["zmin"] == -heat["zmax"]
 
 
-def test_what_is_drawn_over_an_input_is_told_as_it_is(lagged, motion, pages):
+def test_what_is_drawn_over_an_input_is_reported_as_it_is(lagged, motion, pages):
     captions = Read(pages["motion"]).text("figcaption")
     (one,) = [caption for caption in captions if caption.startswith("Over v")]
     assert "the one input of the learner" in one and "variance" not in one
@@ -593,7 +593,7 @@ def test_the_verdict_of_a_comparison_names_a_model(compared):
     )
 
 
-def test_a_witness_is_told_where_runs_are_shown(lagged):
+def test_a_witness_is_reported_where_runs_are_shown(lagged):
     found = "train: findings and figures use 10 of 99 rows, in windows spread over them."
     page = Read(replace(lagged, result=with_warning(lagged, "witness", found)).report().html)
     (section,) = page.text("section", id="free-run")
@@ -656,7 +656,7 @@ def test_a_learned_curve_fills_its_panel_where_data_are():
     assert -1.6 < low < -1.1 and 1.0 < high < 1.5
 
 
-def test_the_bar_of_the_learner_is_the_share_that_the_table_tells(motion):
+def test_the_bar_of_the_learner_is_the_share_that_the_table_says(motion):
     page = FitPage(origin_of(motion.job, "fit"), motion.result, motion.responses)
     table, bar = next(section.blocks for section in fit_sections(page) if section.key == "share")
     part = motion.result.motion.parts[0]
@@ -664,7 +664,7 @@ def test_the_bar_of_the_learner_is_the_share_that_the_table_tells(motion):
     assert table.rows[0][-1] == percent(part.share) and "over that of their sum" in table.caption
 
 
-def test_a_comparison_tells_the_biases(compared):
+def test_a_comparison_says_the_biases(compared):
     def heads(result):
         sections = compare_sections(ComparePage(origin_of(compared.job, "compare"), result, {}))
         table = next(section for section in sections if section.key == "parameters").blocks[-1]

@@ -162,7 +162,7 @@ def test_what_was_written_can_be_read(written):
     assert result.parameters[0].name == "a" and result.scores["train"].prediction.rmse
 
 
-def test_places_are_told_as_the_spec_names_files(written):
+def test_places_are_reported_as_the_spec_names_files(written):
     """A result does not change with the folder that it was made in."""
     worst = json.loads(written)["stability"]["lipschitz"]["worst"]
     assert worst["where"].startswith("experiment 0, run.csv: line")

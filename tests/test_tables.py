@@ -121,7 +121,7 @@ def test_encodings_of_windows(tmp_path, encoding):
 @pytest.mark.parametrize(
     "above", ["Messung 4711\n", "Datum; 4711; kalt\n\nohne Last\n", "a, b, c, d\n", '"bench, 3"\n']
 )
-def test_a_remark_without_a_sign_is_told_from_the_header_by_its_cells(tmp_path, above):
+def test_a_remark_without_a_sign_is_distinguished_from_the_header_by_its_cells(tmp_path, above):
     path = put(tmp_path, "run.csv", above + "u,y\n1,2\n3,4\n")
     assert values(path, "u", "y") == [[1.0, 3.0], [2.0, 4.0]]
     assert read_table(path, ("u",)).first_line == above.count("\n") + 2
@@ -222,7 +222,7 @@ def test_a_first_row_that_holds_no_units_stays_a_row(tmp_path, content):
     assert np.isnan(table.columns["u"][0])
 
 
-def test_columns_of_one_name_are_told_apart(tmp_path):
+def test_columns_of_one_name_are_distinguished(tmp_path):
     path = put(tmp_path, "run.csv", "T [K],u,T [K],T [K]\n1,2,3,4\n")
     assert read_titles(path).names == ["T [K].0", "u", "T [K].1", "T [K].2"]
     assert values(path, "T [K].0", "T [K].2", "u", "T [K].1") == [[1.0], [4.0], [2.0], [3.0]]

@@ -231,7 +231,7 @@ def no_log():
     LOG.setLevel(logging.NOTSET)
 
 
-def test_the_log_tells_the_stages_of_a_fit(project, monkeypatch, caplog, no_log):
+def test_the_log_says_the_stages_of_a_fit(project, monkeypatch, caplog, no_log):
     monkeypatch.chdir(project)
     monkeypatch.setattr(
         "orthaug.commands.fit.with_advice", lambda fitted: fitted

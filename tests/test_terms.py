@@ -140,7 +140,7 @@ def test_on_the_free_run_the_truth_is_inside_the_intervals():
     assert (fit.terms.loc[list(TERMS), "ci95_high"] > [-0.1, -0.2]).all()
 
 
-def test_terms_that_say_nothing_of_their_own_are_left_out_and_told():
+def test_terms_that_say_nothing_of_their_own_are_left_out_and_reported():
     fit = oa.estimate(cubic(), PHYSICS, learner=oa.Terms(("u[k-1]", *TERMS, "2*u[k-1]**2")))
     assert set(fit.terms.index) == set(TERMS)
     (found,) = [w.text for w in fit.warnings if w.code == "terms_left_out"]

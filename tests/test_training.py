@@ -73,7 +73,7 @@ def test_a_run_shows_its_model_while_it_lasts_and_ends_as_without(monkeypatch):
     assert followed.theta == pytest.approx(alone.theta, rel=1e-12)
 
 
-def test_the_lowest_generalised_cross_validation_is_chosen_one_step_ahead_and_told():
+def test_the_lowest_generalised_cross_validation_is_chosen_one_step_ahead_and_reported():
     found = estimate(
         record(), PHYSICS, learner=NETWORK, solver=LM, regularization="auto", restarts=3
     )
@@ -147,7 +147,7 @@ def test_physics_alone_has_the_same_bounds():
     assert found.status.loss <= found.status.start_loss
 
 
-def test_a_start_that_fails_is_told_and_replaced(monkeypatch):
+def test_a_start_that_fails_is_reported_and_replaced(monkeypatch):
     run = FreeRunTask.run
 
     def failing(self, solver, w, *rest):
@@ -225,7 +225,7 @@ def test_the_ratio_of_errors():
     )
 
 
-def test_equal_models_are_rarely_told_apart():
+def test_equal_models_are_rarely_distinguished():
     """Coloured errors of equal size: the 95 % interval holds 1 in at least 90 % of the draws."""
     rng = np.random.default_rng(3)
     codes = [Ratio.of([coloured(rng)], [coloured(rng)]).code for _ in range(200)]

@@ -167,7 +167,7 @@ def test_a_part_within_the_training_range_leaves_nothing():
     )
 
 
-def test_the_range_that_is_left_is_told_once_for_a_channel():
+def test_the_range_that_is_left_is_reported_once_for_a_channel():
     record, far = system(0, 300), system(1, 200, scale=2.0)
     found = {
         e.lag: e for e in extrapolation("tests.far", rows_of(far), rows_of(record), layout_of())
@@ -188,7 +188,7 @@ def test_the_range_that_is_left_is_told_once_for_a_channel():
 @pytest.mark.parametrize(("over", "rows", "told"), [
     (0.005, 100, False), (0.05, 1, False), (0.05, 100, True), (0.5, 1, True), (0.0, 0, False),
 ])  # fmt: skip
-def test_a_range_that_is_hardly_left_is_not_told(over, rows, told):
+def test_a_range_that_is_hardly_left_is_not_reported(over, rows, told):
     """Of a range of 2 over 1000 rows: as noise on the extreme values leaves it."""
     training, x = (np.linspace(-1, 1, 1000)[:, None] for _ in range(2))
     x[:rows] = -1 - 2 * over
@@ -328,7 +328,7 @@ def test_harm_elsewhere_is_not_blamed_on_extrapolation():
     )
 
 
-def test_what_diverges_is_null_in_json_and_told():
+def test_what_diverges_is_null_in_json_and_reported():
     found = judge([Trial("tests.a", 1.0, INF)])
     assert "diverges" in found.text
     assert ValidationResult.model_validate(found).content()["trials"] == [
