@@ -32,6 +32,7 @@ from orthaug.commands.motion import _has_term
 from orthaug.commands.proposals import (
     Proposal,
     _delay,
+    _lag,
     _unique_proposals,
     _without_headings,
     apply_change,
@@ -999,3 +1000,25 @@ def test_a_learner_that_sees_a_heading_is_advised_to_see_it_no_more(tmp_path):
     (first,) = result.advice
     assert first.change == {"learner.inputs": ["r", "rudder"]}
     assert first.after is not None and first.after < 0.1 * first.before
+
+
+def test_a_lag_of_an_input_is_one_in_definitions_and_in_outputs_that_read_it(tmp_path):
+    """An accelerometer went on without the lag, so that advice on it was of no use."""
+    text = SHIP.replace('heading = "psi"', 'heading = "psi"\nturn = "push - a*r"')
+    text = text.replace('["heading"]', '["heading", "turn"]').replace('"K*rudder -', '"push -')
+    text += '[motion.define]\npush = "K*rudder"\n'
+    data = turning_ship(60)[:, [0, 1, 1]]
+    job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading,turn")))
+    late: Any = SimpleNamespace(input="rudder", time_constant=0.3)
+    (proposal,) = _lag(job, late)
+    assert proposal.change.keys() == {
+        "motion.define.push",
+        "motion.states.rudder_late",
+        "motion.parameters.T",
+    }
+    assert proposal.change["motion.define.push"] == "K*rudder_late"
+    text = text.replace('"push - a*r"\n', '{ expression = "K*rudder - a*r", learned = true }\n')
+    job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading,turn")))
+    (proposal,) = _lag(job, late)
+    changed = {"expression": "K*rudder_late - a*r", "learned": True}
+    assert proposal.change["motion.outputs.turn"] == changed
