@@ -477,7 +477,8 @@ def _without_headings(job: Job) -> Iterator[Proposal]:
     unread = [name for name in seen if name in motion.names_of_states and name not in read]
     kept = [text for text in seen if text not in unread]
     if unread and kept:
-        words = f"a learner that does not see {join_words(unread)}, which no equation reads"
+        reads = f"no equation reads {'it' if len(unread) == 1 else 'them'}"
+        words = f"a learner that does not see {join_words(unread)} ({reads})"
         yield Proposal(words, {"learner.inputs": kept}, learns=True, narrows=True)
 
 
