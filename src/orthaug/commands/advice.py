@@ -257,10 +257,10 @@ def _tried(
         return trials.of(proposal)
 
     # Where samples are to be mended, what seems missing may come from these: it is tried after them
+    narrow = [proposal for proposal in found if proposal.narrows]
     replacing = [proposal for proposal in found if proposal.replaces]
-    others = [proposal for proposal in found if not proposal.replaces]
-    chosen = [*replacing, *others[: job.physics.most_trials]]
-    chosen.sort(key=lambda proposal: not proposal.narrows)
+    others = [proposal for proposal in found if not (proposal.narrows or proposal.replaces)]
+    chosen = [*narrow, *replacing, *others[: job.physics.most_trials]]
     runs = iterate_results(errors_of, [Proposal("the spec as it is", {}), *(mending or chosen)])
     base = next(runs).pieces
     if base is None:
@@ -268,7 +268,7 @@ def _tried(
     before = math.sqrt(mean_square(base))
     far_off = before > _FAR_OFF * here
     if far_off:  # which a learner that sees less may mend
-        narrow = [proposal for proposal in chosen if proposal.narrows and not mending]
+        narrow = [] if mending else narrow
         tried = [next(runs) for _ in narrow]
         if not any(one.error <= _FAR_OFF * here and _helps(one, base) for one in tried):
             share = f"has an error of {before:.3g} of the output's deviation"
