@@ -32,7 +32,9 @@ from orthaug.commands.motion import _has_term
 from orthaug.commands.proposals import (
     Proposal,
     _delay,
+    _lag,
     _unique_proposals,
+    _without_headings,
     apply_change,
     mending_proposals,
     noise_model_proposals,
@@ -941,3 +943,82 @@ def test_a_change_that_is_surely_worse_is_said_to_be():
         "text above advises it."
     )
     assert "worse" not in text_on(1.0)
+
+
+SHIP = """
+[data]
+sampling_time = 0.1
+inputs = ["rudder"]
+outputs = ["heading"]
+train = { files = ["run.csv"] }
+[motion]
+substeps = 1
+[motion.states]
+psi = { derivative = "r", start = "heading" }
+r = { derivative = "K*rudder - a*r", start = "derivative of heading", learned = true }
+[motion.outputs]
+heading = "psi"
+[motion.parameters]
+K = { initial = 1.0, min = 0 }
+a = { initial = 1.0, min = 0 }
+[learner]
+hidden = [2]
+[validation]
+blocks = 0
+"""
+
+
+def turning_ship(rows: int) -> np.ndarray:
+    """Rudder and heading (rows, 2) of a ship with a cubic damper, which turns on and on."""
+    rng = np.random.default_rng(5)
+    rudder = np.repeat(rng.uniform(-0.6, 1, rows // 15 + 1), 15)[:rows]
+    heading, psi, r = np.zeros(rows), 0.0, 0.0
+    for k, angle in enumerate(rudder):
+        heading[k] = psi
+        for _ in range(10):
+            psi += 0.01 * r
+            r += 0.01 * (angle - 0.5 * r - 0.8 * r**3)
+    return np.column_stack([rudder, heading + 0.003 * rng.normal(size=rows)])
+
+
+def test_a_learner_without_the_heading_is_proposed_where_no_equation_reads_it(tmp_path):
+    data = turning_ship(60)
+
+    def proposed(text: str) -> list[dict[str, Any]]:
+        job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading")))
+        return [one.change for one in _without_headings(job)]
+
+    assert proposed(SHIP) == [{"learner.inputs": ["r", "rudder"]}]
+    assert proposed(SHIP.replace("- a*r", "- a*r - 0.1*psi")) == []
+    assert proposed(SHIP.replace("[2]", '[2]\ninputs = ["r"]')) == []
+    assert proposed(SHIP.replace("hidden = [2]", 'kind = "none"')) == []
+
+
+def test_a_learner_that_sees_a_heading_is_advised_to_see_it_no_more(tmp_path):
+    """No change was tried, for this learner does not go on from two thirds of the rows."""
+    result = oa.fit_spec(str(put(tmp_path, SHIP, turning_ship(400), "rudder,heading"))).result
+    (first,) = result.advice
+    assert first.change == {"learner.inputs": ["r", "rudder"]}
+    assert first.after is not None and first.after < 0.1 * first.before
+
+
+def test_a_lag_of_an_input_is_one_in_definitions_and_in_outputs_that_read_it(tmp_path):
+    """An accelerometer went on without the lag, so that advice on it was of no use."""
+    text = SHIP.replace('heading = "psi"', 'heading = "psi"\nturn = "push - a*r"')
+    text = text.replace('["heading"]', '["heading", "turn"]').replace('"K*rudder -', '"push -')
+    text += '[motion.define]\npush = "K*rudder"\n'
+    data = turning_ship(60)[:, [0, 1, 1]]
+    job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading,turn")))
+    late: Any = SimpleNamespace(input="rudder", time_constant=0.3)
+    (proposal,) = _lag(job, late)
+    assert proposal.change.keys() == {
+        "motion.define.push",
+        "motion.states.rudder_late",
+        "motion.parameters.T",
+    }
+    assert proposal.change["motion.define.push"] == "K*rudder_late"
+    text = text.replace('"push - a*r"\n', '{ expression = "K*rudder - a*r", learned = true }\n')
+    job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading,turn")))
+    (proposal,) = _lag(job, late)
+    changed = {"expression": "K*rudder_late - a*r", "learned": True}
+    assert proposal.change["motion.outputs.turn"] == changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -137,6 +138,16 @@ def test_a_learner_is_named_with_what_it_does_not_see():
     assert str(change).startswith(
         "with a learner that also sees y[k-1], y[k-2] its error one step ahead is"
     )
+
+
+def test_a_learner_that_was_tried_in_vain_is_not_proposed_as_if_none_had_been():
+    alone = fitted(cubic=-0.01, noise=0.1, sensor=0.0)
+    asked = replace(alone.setup, options={**alone.setup.options, "learner": MLP((3,))})
+    named = [
+        next(one.what for one in changes_of(fit) if one.kind == "learner")
+        for fit in (alone, replace(alone, setup=asked))
+    ]
+    assert named == ["a learner", "another learner than the one that was tried"]
 
 
 @pytest.mark.parametrize("criterion", [None, Simulation(0, 40)], ids=["one step", "free run"])

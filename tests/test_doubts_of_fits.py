@@ -1,6 +1,8 @@
 """What a fit says of causes that it cannot know: found by trials on systems that no example has."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import scipy.signal
 from test_cli import run
 
 import orthaug as oa
-from orthaug.analysis.doubts import _names_of_experiments
+from orthaug.analysis.doubts import _movement_text, _names_of_experiments
 from orthaug.analysis.input_timing import LateInput, try_holds
 from orthaug.analysis.missing_terms import missing_terms
 
@@ -715,3 +717,23 @@ def test_no_interval_is_spoken_of_where_none_is_given():
     assert texts["coloured_residual"].endswith("Missing physics may have moved the parameters.")
     assert texts.pop("too_long_memory").startswith("no standard errors and no intervals")
     assert not any("ntervals" in text for text in texts.values())
+
+
+@pytest.mark.parametrize(
+    ("moves", "text"),
+    [
+        ((0.1, -0.2), " With it the fit gives T 16.37 instead of 20, K 0.11 instead of 0.1."),
+        ((0.1, -250.0), ""),
+        ((0.1, 250.0), ""),
+        ((0.1, 1e4), ""),
+    ],
+)
+def test_a_step_of_a_logarithm_that_goes_too_far_gives_no_values(moves, text):
+    """The values of a fit with a missing state were K 0 and T 5.571e-109."""
+    problem = SimpleNamespace(
+        names=("K", "T"), values_at=lambda theta: np.array([theta[0], np.exp(theta[1])])
+    )
+    values = np.array([0.1, 20.0])
+    fit: Any = SimpleNamespace(problem=problem, values=values, theta=[0.1, np.log(20.0)])
+    with_state: Any = SimpleNamespace(moves=(moves[0] / 10, moves[1]))
+    assert _movement_text(fit, with_state) == text

@@ -250,6 +250,15 @@ def test_the_turning_points_of_an_encoder_are_no_limit(tmp_path):
     assert found.find("clipped").limits == ((clipped.max(), int(np.sum(clipped == clipped.max()))),)
 
 
+def test_all_nights_are_rows_without_sun(tmp_path):
+    """They are longer than the days, so that the row as far before a night is in the last one."""
+    t = np.arange(2000)
+    day = 800 + 100 * np.sin(t)
+    sun = np.round(np.maximum(0, -day * (np.sin(2 * np.pi * t / 100) + 0.1)), 2)
+    pd.DataFrame({"sun": sun}).to_csv(tmp_path / "a.csv", index=False)
+    assert survey(tmp_path / "a.csv").find("sun").limits == ((0.0, int(np.sum(sun == 0))),)
+
+
 @pytest.mark.parametrize("decimals", [2, 4, None])
 def test_the_rounding_of_a_slow_sine_excites_nothing(decimals):
     u = 20 + 4 * np.sin(2 * np.pi * np.arange(1500) / 287)

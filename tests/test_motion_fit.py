@@ -21,6 +21,7 @@ from orthaug.analysis.verdict_text import describe_colour, small_effects
 from orthaug.data.expressions import parse_named
 from orthaug.fitting.conclusion import reopen_estimate
 from orthaug.fitting.field_points import field_under
+from orthaug.fitting.motion_estimate import shared_in_words
 from orthaug.inference.splitting import nearest, shared_of_motion
 from orthaug.models.learners import Bound
 from orthaug.models.motion_field import parts_at
@@ -339,6 +340,9 @@ def test_what_the_prior_of_the_weights_holds_has_no_interval() -> None:
     imitated, _ = imitable(fit, given)
     assert imitated is not None and imitated.determined == ("a",)
     assert "the data determine all of them but b" in imitated.text
+    none = imitated.beside_collinear([("a",), ("b",)])
+    assert "no change of a parameter, but the data determine none of the parameters" in none.text
+    assert shared_in_words(fit.shared, ("a", "b")) == "nothing, but the data determine no parameter"
 
 
 def test_a_parameter_whose_effect_the_data_do_not_want_is_named():

@@ -555,3 +555,18 @@ def test_the_size_of_a_cause_is_that_of_its_trace(
     assert (
         motion_budget(alone, oa.suspected_bias(alone, [FRICTION])).coefficient == found.coefficient
     )
+
+
+def test_terms_of_a_difference_in_an_equation_are_usual_suspects():
+    """Of heat that leaves by (T - outside)**1.5 a constant was the cause that came nearest."""
+    states = [oa.State("T", "(heat - h*(T - outside))/C", start="y")]
+    motion = oa.Motion.from_equations(
+        states,
+        [oa.Output("y", "T")],
+        [oa.PhysicalParameter(n, 1.0) for n in "hC"],
+        ["heat", "outside"],
+    )
+    rng = np.random.default_rng(0)
+    temperature, rows = 20 + rng.normal(size=(1, 50)), rng.normal(size=(2, 50))
+    usual = Catalogue.of_motion(motion, motion.initial, temperature.T, rows.T).usual()
+    assert "quadratic_drag of T - outside" in {suspect.name for suspect in usual}

@@ -327,6 +327,13 @@ def test_a_learner_that_does_not_help_is_no_reason_to_leave_parameters_undetermi
     assert "without it" not in fit_verdict(doubted).use
 
 
+def test_what_no_learner_imitates_is_not_said_to_be_imitated():
+    free = KNOWN.model_copy(update={"name": "b", "shared": True, "ci95": None})
+    found = fitted(parameters=[KNOWN, free], warnings=[Warning("not_identified", "")])
+    said = fit_verdict(found).use
+    assert "not determine b, because the learner could make up for other values" in said
+
+
 def test_what_is_in_doubt_beside_the_learner_is_not_read_as_physics():
     doubt = "training had not converged"
     shared = SharedResult.model_construct(withdrawn=["a"], doubt=doubt)

@@ -364,7 +364,9 @@ class Candidates:
         model, problem = self.fit.model, self.fit.problem
         if not model.learns:
             seen = ", ".join(map(str, self.unread))
-            return f"a learner that also sees {seen}" if seen else "a learner"
+            tried = self.fit.setup is not None and self.fit.setup.learns
+            other = "another learner than the one that was tried" if tried else "a learner"
+            return f"a learner that also sees {seen}" if seen else other
         visible = seen_columns(problem.features, problem.layout, problem.rows.x, lambda rows: rows)
         hidden = [str(lag) for lag, one in zip(problem.layout, visible, strict=True) if not one]
         hidden += map(str, self.unread)

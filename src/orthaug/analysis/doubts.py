@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from orthaug._base.checks import Vector
 from orthaug._base.errors import Warning, visible
 from orthaug._base.lines import first_words, percent
 from orthaug._base.progress import Stage
@@ -433,8 +432,6 @@ def _movement_text(fit: Any, best: FamilyTest) -> str:
     if not values:
         return ""
     now = _current_values(fit)
-    if any(abs(values[name]) > _FAR * abs(now[name]) > 0 for name in values):
-        return ""  # one linear step that far is no estimate
     moves = sorted(
         values, key=lambda name: -abs(values[name] - now[name]) / max(abs(now[name]), 1e-300)
     )
@@ -449,16 +446,21 @@ def _current_values(fit: Any) -> dict[str, float]:
 
 
 def _values_with(fit: Any, best: FamilyTest) -> dict[str, float]:
-    """Return the parameters of a fit with an additional term."""
-    names = list(_current_values(fit))
-    moved: Vector = np.asarray(fit.theta) + np.array(best.moves)
-    if len(best.moves) != len(names):
+    """Return the parameters of a fit with an additional term.
+
+    None of them where one linear step goes too far to be an estimate: as far in the other direction
+    it would be noticed of the logarithm of one that falls to nothing.
+    """
+    now, moves = _current_values(fit), np.array(best.moves)
+    if len(moves) != len(now):
         return {}
-    with np.errstate(over="ignore"):  # one linear step may go far; what is not finite is left out
-        values = fit.problem.values_at(moved)
-    return {
-        name: float(value) for name, value in zip(names, values, strict=True) if np.isfinite(value)
-    }
+    size = np.abs(list(now.values()))
+    with np.errstate(over="ignore"):
+        steps = [fit.problem.values_at(np.asarray(fit.theta) + sign * moves) for sign in (1, -1)]
+    far = [np.abs(step)[size > 0] > _FAR * size[size > 0] for step in steps]
+    if np.any(far) or not np.isfinite(steps).all():
+        return {}
+    return dict(zip(now, map(float, steps[0]), strict=True))
 
 
 def _structure(fit: Any, test: StructureTest, *, hidden: bool) -> StructureResult:

@@ -99,10 +99,12 @@ class Imitation:
         determined = tuple(name for name in self.determined if name not in lost)
         return replace(self, determined=determined, alternatives=others, inseparable=lost)
 
-    @property
-    def _excepted(self) -> str:
-        """Names that the data do not determine with any learner; empty where there are none."""
-        return f" but {join_words(self.inseparable)}" if self.inseparable else ""
+    def _determines(self, every: str) -> str:
+        """Return what data determine where a learner could imitate nothing, as a clause."""
+        if self.inseparable and not self.determined:
+            return ", but the data determine none of the parameters"
+        but = f" but {join_words(self.inseparable)}" if self.inseparable else ""
+        return f": the data determine {every}{but}{_PROVIDED}"
 
     @property
     def text(self) -> str:
@@ -124,10 +126,7 @@ class Imitation:
         if not self.directions:
             rest = " other" if self.held else ""
             text = f"{sees} and could imitate nothing of the{rest} physics"
-            return (
-                f"{text}: the data determine every{rest} parameter{self._excepted}{_PROVIDED}."
-                f"{self._nearly}"
-            )
+            return f"{text}{self._determines(f'every{rest} parameter')}.{self._nearly}"
         could = join_words([_combination(direction) for direction in self.directions])
         along = "this direction" if len(self.directions) == 1 else "these directions"
         sentences = [
@@ -182,10 +181,8 @@ class MotionImitation(Imitation):
                 "determine them; the physics nearest to the fitted motion does."
             )
         if not self.directions:
-            return (
-                f"{sees} and could imitate no change of a parameter: the data determine all of "
-                f"them{self._excepted}{_PROVIDED}.{self._remembered}"
-            )
+            text = f"{sees} and could imitate no change of a parameter"
+            return f"{text}{self._determines('all of them')}.{self._remembered}"
         moved = "; ".join(" with ".join(direction) for direction in self.directions)
         text = (
             f"{sees} and could imitate a change of {moved}. Along this change the data alone "

@@ -257,24 +257,35 @@ def _tried(
         return trials.of(proposal)
 
     # Where samples are to be mended, what seems missing may come from these: it is tried after them
+    narrow = [proposal for proposal in found if proposal.narrows]
     replacing = [proposal for proposal in found if proposal.replaces]
-    others = [proposal for proposal in found if not proposal.replaces]
-    chosen = [*replacing, *others[: job.physics.most_trials]]
+    others = [proposal for proposal in found if not (proposal.narrows or proposal.replaces)]
+    chosen = [*narrow, *replacing, *others[: job.physics.most_trials]]
     runs = iterate_results(errors_of, [Proposal("the spec as it is", {}), *(mending or chosen)])
     base = next(runs).pieces
     if base is None:
         return None
     before = math.sqrt(mean_square(base))
-    if before > _FAR_OFF * here:
-        share = f"has an error of {before:.3g} of the output's deviation"
-        does = "diverges" if math.isinf(before) else share
-        text = (
-            f"No change of the spec was tried: fitted to fewer rows, the model {does} in free run "
-            f"over {rows.where}, where the error of this one is {_error(here)}. The rows before do "
-            "not determine it, so a comparison there would say little."
-        )
-        return [], AdviceTrialsResult(text=text, tried=0, not_tried=len(mending) + len(found))
-    tried = list(runs)
+    far_off = before > _FAR_OFF * here
+    if far_off:  # which a learner that sees less may mend
+        narrow = [] if mending else narrow
+        tried = [next(runs) for _ in narrow]
+        if not any(one.error <= _FAR_OFF * here and _helps(one, base) for one in tried):
+            share = f"has an error of {before:.3g} of the output's deviation"
+            does = "diverges" if math.isinf(before) else share
+            words = [f"{one.proposal.words} ({_error_text(one, base)})" for one in tried]
+            text = f"No sure gain over {_error(before)}: {'; '.join(words)}. " if tried else ""
+            text += (
+                f"No {'further ' if tried else ''}change of the spec was tried: fitted to fewer "
+                f"rows, the model {does} in free run over {rows.where}, where the error of this "
+                f"one is {_error(here)}. The rows before do not determine it, so a comparison "
+                "there would say little."
+            )
+            left = len(mending) + len(found) - len(tried)
+            return [], AdviceTrialsResult(text=text, tried=len(tried), not_tried=left)
+        chosen = narrow
+    else:
+        tried = list(runs)
     if mending and any(_helps(one, base) for one in tried):
         chosen = []
     elif mending:

@@ -140,7 +140,9 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             change = {f"motion.outputs.{place}": now | {"expression": f"{own} + {added}"}}
             return change, f"in the equation of the output {place}"
         if place in motion.inputs:
-            return self._beside_input(job, str(place), added), f"beside the input {place}"
+            return self._in_place_of_input(job, place, f"({place} + {added})"), (
+                f"beside the input {place}"
+            )
         if place not in motion.names_of_states:
             return None
         key = motion.equation_key
@@ -149,24 +151,27 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return None
         return {f"motion.states.{place}.{key}": f"{own} + {added}"}, f"in the equation of {place}"
 
-    def _beside_input(self, job: Job, place: str, added: str) -> dict[str, Any]:
-        """Return the equations and definitions with a term beside an input."""
+    def _in_place_of_input(self, job: Job, name: str, expression: str) -> dict[str, Any]:
+        """Return the change that gives an input another value in equations and definitions.
+
+        An output that reads it, such as an acceleration, is no exception.
+        """
         key, declared = self.motion.equation_key, job.declaration["motion"]
-        word = re.compile(rf"\b{re.escape(place)}\b")
-        texts = {
-            f"motion.states.{state}.{key}": str(entry[key])
-            for state, entry in declared["states"].items()
-        }
-        texts |= {
-            f"motion.define.{defined}": str(text)
-            for defined, text in declared.get("define", {}).items()
-        }
-        both = f"({place} + {added})"
-        return {
-            path: word.sub(lambda _: both, text)
+        word = re.compile(rf"\b{re.escape(name)}\b")
+        states, defined = declared["states"], declared.get("define", {})
+        outputs = {output: declared_output(job, output) for output in declared["outputs"]}
+        texts = {f"motion.states.{state}.{key}": str(own[key]) for state, own in states.items()}
+        texts |= {f"motion.define.{own}": str(text) for own, text in defined.items()}
+        change: dict[str, Any] = {
+            path: word.sub(lambda _: expression, text)
             for path, text in texts.items()
             if word.search(text)
         }
+        for output, own in outputs.items():
+            if word.search(own["expression"]):
+                text = word.sub(lambda _: expression, own["expression"])
+                change[f"motion.outputs.{output}"] = own | {"expression": text}
+        return change
 
     def with_lag(
         self, job: Job, late: LateInputResult, name: str
@@ -175,16 +180,15 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         state = f"{late.input}_late"
         if not states or motion.functions is not None:
             return None
-        if motion.definitions or state in {*self.names_taken(job.spec), *motion.inputs}:
+        if state in {*self.names_taken(job.spec), *motion.inputs}:
             return None
-        key, word = motion.equation_key, re.compile(rf"\b{re.escape(late.input)}\b")
-        change: dict[str, Any] = {
-            f"motion.states.{other}.{key}": word.sub(state, str(entry[key]))
-            for other, entry in states.items()
-        }
+        change = self._in_place_of_input(job, late.input, state)
         moving = self._moving("lag", late.input, None, state, name)
         change |= {
-            f"motion.states.{state}": {key: moving, "start": _first_of(job, late.input)},
+            f"motion.states.{state}": {
+                motion.equation_key: moving,
+                "start": _first_of(job, late.input),
+            },
             f"motion.parameters.{name}": {"initial": late.time_constant, "min": 0},
         }
         return change, f"a lag of {late.input} (the state {state}, time constant {name})"

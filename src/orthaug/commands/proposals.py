@@ -64,6 +64,8 @@ class Proposal:
     replaces: bool = False
     """True if a term takes the learner's place: its parameters are then the physics' alone, so that
     it is advised where it does as well."""
+    narrows: bool = False
+    """True if the learner sees less: fewer rows may determine it then."""
     ahead: tuple[float, float] | None = None
     """What errors' past does not predict of them, without the change and with it, where that shows
     it: beside slow disturbances its gain in a free run is hidden."""
@@ -194,6 +196,7 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
         return _unique_proposals([proposal for proposal in late if proposal.ahead])
     states = list(_missing_states(job, result))
     first, then = (states, late) if states and _state_explains_more(result) else (late, states)
+    first = [*_without_headings(job), *first]
     found = [
         *first,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
@@ -454,6 +457,29 @@ def _learner(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
             {"learner.hidden": wider},
             learns=True,
         )
+
+
+def _without_headings(job: Job) -> Iterator[Proposal]:
+    """Yield a learner that does not see the states of a motion that no equation reads.
+
+    A heading, or the position of what no spring holds, does not come back to where it was: what is
+    learned of it over some rows holds for no others.
+    """
+    problem = job.problem
+    network = job.declaration.get("learner", {}).get("kind", _NETWORK) == _NETWORK
+    if job.physics.section != "motion" or job.spec.declared_learner() is None or not network:
+        return
+    motion = problem.motion
+    if motion.functions is not None:
+        return
+    read = motion.names_in(*motion.equations.values())
+    seen = [feature.text for feature in problem.features]
+    unread = [name for name in seen if name in motion.names_of_states and name not in read]
+    kept = [text for text in seen if text not in unread]
+    if unread and kept:
+        reads = f"no equation reads {'it' if len(unread) == 1 else 'them'}"
+        words = f"a learner that does not see {join_words(unread)} ({reads})"
+        yield Proposal(words, {"learner.inputs": kept}, learns=True, narrows=True)
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:

@@ -204,7 +204,8 @@ def _turning_rows(x: Vector, edges: Any, level: float) -> int:
         if n < 2 or x[begin] != level:
             continue
         most = step * ((3 * n - 1) / (n - 1)) ** 2
-        around = x[[max(begin - n, 0), min(end - 1 + n, len(x) - 1)]]
+        # All of them: twelve hours before a night without sun is the night before
+        around = x[max(begin - n, 0) : end + n]
         if (np.abs(around - level) <= most).all():
             found += n
     return found

@@ -316,6 +316,8 @@ def shared_in_words(shared: SharedDirections, unidentified: Sequence[str] = ()) 
         unidentified: parameters that neither the fit nor the nearest physics determines.
     """
     if not shared.basis.size:
+        if unidentified and set(shared.untouched) <= set(unidentified):
+            return "nothing, but the data determine no parameter"
         excepted = f" but {join_words(unidentified)}" if unidentified else ""
         return f"nothing: the data determine all parameters{excepted}"
     if shared.all:

@@ -480,15 +480,14 @@ def _use_text(result: Findings, level: str) -> str:
     if bare:
         have = "has no interval" if len(bare) == 1 else "have no intervals"
         text += f". {join_words(bare)} {have}, which would say how close to physics that is"
-    text += (
-        f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be read as "
-        "physics"
-        if others
-        else ""
-    )
+    if others:
+        text += f". {join_words(others)} {_verb_for(others)} too uncertain or too biased to be "
+        text += "read as physics"
     if shared:
+        does = f"imitate {'it' if len(shared) == 1 else 'them'}"
+        does = "make up for other values" if _has_warning(result, "not_identified") else does
         text += f". The data alone do not determine {join_words(shared)}, because the learner could"
-        text += f" imitate {'it' if len(shared) == 1 else 'them'}"
+        text += f" {does}"
         if _code(result) == "no_help" and _noise_alone(result):
             text += (
                 '. The learner does not help: without it (`learner.kind = "none"`) the data '
