@@ -102,6 +102,7 @@ _LESS_EFFORT = {
 # For what runs a few times only: a quarter of the time to compile, and runs take four times as long
 _LEAST_EFFORT = {**_LESS_EFFORT, "xla_backend_optimization_level": 0}
 _SMALL = 1 << 15  # numbers in an argument: with more, runs are worth any time to compile
+_LITTLE = 1 << 23  # numbers that are computed: with more the same holds
 
 
 class _Compiled:
@@ -113,16 +114,22 @@ class _Compiled:
     """
 
     def __init__(
-        self, function: Callable[..., Any], effort: dict[str, Any], options: dict[str, Any]
+        self,
+        function: Callable[..., Any],
+        effort: dict[str, Any],
+        options: dict[str, Any],
+        work: Callable[[Any], int] | None = None,
     ) -> None:
         functools.update_wrapper(self, function)
+        self._work = work
         self._function, self._effort, self._options = function, effort, options
         self._lock = threading.Lock()
         named = "<" not in getattr(function, "__qualname__", "<")  # objects have no name
         self._may_be_kept = named and options.keys() <= {"static_argnames", "static_argnums"}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        small = _are_small((args, kwargs))
+        most = _SMALL if self._work is None else _LITTLE // max(self._work(args[0]), 1)
+        small = _are_small((args, kwargs), min(most, _SMALL))
         if small is not None and self._may_be_kept and _kept:
             result = self._of_kept(small, args, kwargs)
             if result is not NotImplemented:
@@ -141,7 +148,7 @@ class _Compiled:
     def __reduce__(self) -> Any:
         """Return what pickle keeps: the name in its module, as of a function."""
         if "<locals>" in self._function.__qualname__:
-            return type(self), (self._function, self._effort, self._options)
+            return type(self), (self._function, self._effort, self._options, self._work)
         return self._function.__qualname__
 
     def _of_kept(self, small: bool, args: Any, kwargs: Any) -> Any:
@@ -184,12 +191,17 @@ def _late_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any
     return _Compiled(function, _LESS_EFFORT, options)
 
 
-def quick_jit(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+def quick_jit(
+    function: Callable[..., Any], work: Callable[[Any], int] | None = None, **options: Any
+) -> Callable[..., Any]:
     """Return `jax.jit(function, **options)` for a program that runs a few times only.
 
     On small data it is compiled with the least effort.
+
+    Args:
+        work: of the first argument: how many numbers are computed for each one that is given.
     """
-    return _Compiled(function, _LEAST_EFFORT, options)
+    return _Compiled(function, _LEAST_EFFORT, options, work)
 
 
 @functools.cache
@@ -205,15 +217,15 @@ def _efforts_known() -> bool:
     return True
 
 
-def _are_small(arguments: Any) -> bool | None:
-    """Return whether all arguments are small; None if one is not known yet."""
+def _are_small(arguments: Any, most: int) -> bool | None:
+    """Return whether no argument has more numbers; None if one is not known yet."""
     from jax.core import Tracer
 
     small = True
     for leaf in _real_jax().tree.leaves(arguments):
         if isinstance(leaf, Tracer):
             return None
-        small = small and getattr(leaf, "size", 0) <= _SMALL
+        small = small and getattr(leaf, "size", 0) <= most
     return small
 
 

@@ -11,7 +11,13 @@ from jaxtyping import Float
 from orthaug._base.checks import Matrix, Vector, positive
 from orthaug._base.errors import InputError, Warning
 from orthaug._base.jax import AnyArray, Array, jax, jnp, quick_jit
-from orthaug.fitting.segments import Segments
+from orthaug.fitting.segments import (
+    Segments,
+    cut_steps,
+    flatten_steps,
+    slopes_per_number,
+    steps_at_once,
+)
 from orthaug.inference.measures import Measure, Support
 from orthaug.inference.splitting import Field, beyond_data, rest_of
 from orthaug.models.dynamics import Numbers
@@ -94,14 +100,12 @@ def wobble(
     for start, inputs, _, scored, own in zip(
         states, *map(np.asarray, segments[1:]), slope, strict=True
     ):
-        n0 = start.shape[0]
-        found = np.asarray(_sum_over(form, numbers, start, inputs, scored, q, size))
-        of_start = np.moveaxis(found[:, :n0], -1, 0)  # (m, np, n0)
-        total += found[:, n0:].sum(axis=-1) - np.einsum("mqi,min->qn", of_start, own)
+        to_start, to_unknowns = _sum_over(form, numbers, start, inputs, scored, q, size)
+        total += np.asarray(to_unknowns) - np.einsum("qim,min->qn", np.asarray(to_start), own)
     return total / segments.count
 
 
-@partial(quick_jit, static_argnames="form")
+@partial(quick_jit, work=slopes_per_number, static_argnames="form")
 def _sum_over(
     form: MotionDynamics,
     numbers: Numbers,
@@ -110,9 +114,13 @@ def _sum_over(
     scored: Array,
     q: Float[Array, "np"],
     size: Float[Array, "nl"],
-) -> Float[Array, "np n0+n m"]:
+) -> tuple[Float[Array, "np n0 m"], Float[Array, "np n"]]:
+    """Return `Σ φ_qx dx/d(start)` of each segment, and `Σ φ_qx dx/d(c, w)` of all.
+
+    The rows φ_qx go back through the steps, because they are fewer than the unknowns.
+    """
     numbers = form.prepare(numbers)
-    c, w = numbers.c, numbers.weights
+    c, w, n0, width = numbers.c, numbers.weights, *state.shape
 
     def mixed_derivative(x: AnyArray, row: Any) -> Array:
         def half(q: Array, x: Array) -> Any:
@@ -121,15 +129,28 @@ def _sum_over(
 
         return jax.jacfwd(jax.grad(half), 1)(q, x)
 
-    def step(carry: Any, row: Any) -> Any:
-        state, slopes, total = carry
-        inputs, there = row
-        turned = jax.vmap(mixed_derivative, -1, -1)(state, inputs)
-        turned = jnp.where(jnp.isfinite(turned) & there, turned, 0.0)
-        total = total + jnp.einsum("qim,inm->qnm", turned, slopes)
-        state, slopes, _, _ = form.tangents(numbers, state, slopes, inputs)
-        return (state, slopes, total), None
+    def back(adjoint: Array, row: tuple[Array, ...]) -> tuple[Array, Array]:
+        turned, to_state, own = row
+        through = jnp.einsum("qim,ijm->qjm", adjoint, to_state)
+        return turned + through, jnp.einsum("qim,inm->qn", adjoint, own)
 
-    width, n = state.shape[1], form.states + form.unknowns
-    carry = (state, form.first_slopes(width), jnp.zeros((len(q), n, width)))
-    return jax.lax.scan(step, carry, (inputs, scored))[0][2]
+    def block(carry: tuple[Array, Array], rows: tuple[Array, ...]) -> tuple[Any, None]:
+        adjoint, total = carry
+        states, inputs, there = rows
+        x, u = flatten_steps(states), flatten_steps(inputs)
+        turned = jax.vmap(mixed_derivative, -1, -1)(x, u)
+        turned = jnp.where(jnp.isfinite(turned) & there.reshape(-1), turned, 0.0)
+        _, to_state, own = form.local(numbers, x, u)
+        by_step = tuple(
+            jnp.moveaxis(part.reshape(*part.shape[:-1], len(states), width), -2, 0)
+            for part in (turned, to_state[:n0], own[:n0])
+        )
+        adjoint, own = jax.lax.scan(back, adjoint, by_step, reverse=True)
+        return (adjoint, total + own.sum(axis=0)), None
+
+    step = jax.vmap(lambda state, row: form.step(numbers, state, row)[0], -1, -1)
+    _, states = jax.lax.scan(lambda x, row: (step(x, row), x), state, inputs)
+    nothing = (jnp.zeros((len(q), n0, width)), jnp.zeros((len(q), form.unknowns)))
+    most = max(steps_at_once(form, width), 1)
+    rows = (*cut_steps((states, inputs), most, "edge"), *cut_steps((scored,), most))
+    return jax.lax.scan(block, nothing, rows, reverse=True)[0]

@@ -138,7 +138,7 @@ class MotionEstimate(Estimate):
             moving = partial(
                 wobble,
                 segmented.dynamics,
-                whole,
+                whole.free,  # the run is within the limits, and its slopes take longer with them
                 segmented.segments,
                 self.states,
                 self.slope,

@@ -210,7 +210,12 @@ def sensitivity(
     return Sensitivity(*jax.lax.scan(one_chunk, jnp.zeros((n + 1, n + 1)), rows))
 
 
-@partial(quick_jit, static_argnames="dynamics")
+def slopes_per_number(dynamics: Dynamics) -> int:
+    """Return how many slopes a step computes for each number of its row, about."""
+    return dynamics.unknowns * getattr(dynamics, "substeps", 1)
+
+
+@partial(quick_jit, work=slopes_per_number, static_argnames="dynamics")
 def sensitivity_once(dynamics: Dynamics, *given: Any) -> Sensitivity:
     """Return `sensitivity` of dynamics for which it is called once: its compilation counts."""
     return sensitivity(dynamics, *given)
@@ -223,13 +228,20 @@ def chunk_sensitivity(
     state, *rows = chunk
     n0, width = state.shape
     n = dynamics.unknowns
-    at_once = _BLOCK // (width * (n0 + len(dynamics.outputs)) * (n0 + n)) if n0 else 0
+    at_once = steps_at_once(dynamics, width)
     blocks = isinstance(dynamics, AutodiffDynamics) and at_once >= _FEWEST
-    advance = partial(_steps_at_once, at_once) if blocks else _step_by_step
+    advance = partial(_by_blocks, at_once) if blocks else _step_by_step
     nothing = (jnp.zeros((n + 1, n + 1)), jnp.zeros((n0, n0 + n + 1, width)))
     return Sensitivity(
         *advance(dynamics, numbers, (state, dynamics.first_slopes(width), *nothing), rows, weight)
     )
+
+
+def steps_at_once(dynamics: Dynamics, width: int) -> int:
+    """Return the steps of so many segments whose slopes are held at once; 0 without states."""
+    n0 = dynamics.states
+    rows = width * (n0 + len(dynamics.outputs)) * (n0 + dynamics.unknowns)
+    return _BLOCK // rows if n0 else 0
 
 
 def _columns(scored: Array, slope: Array, target: Array, value: Array, weight: Array) -> Array:
@@ -269,7 +281,7 @@ def _step_by_step(
         shared, own = _with_sums(shared, own, columns, n0)
         return (*running, shared, own), None
 
-    return jax.lax.scan(block, carry, _cut(rows, max(size, 1)))[0][2:]
+    return jax.lax.scan(block, carry, cut_steps(rows, max(size, 1)))[0][2:]
 
 
 def _with_sums(shared: Array, own: Array, columns: Array, n0: int) -> tuple[Array, Array]:
@@ -280,18 +292,23 @@ def _with_sums(shared: Array, own: Array, columns: Array, n0: int) -> tuple[Arra
     return shared, own
 
 
-def _cut(rows: Any, most: int) -> tuple[Array, ...]:
-    """Return rows (T, …) in blocks of at most so many steps, the last one padded with zeros."""
+def cut_steps(rows: Any, most: int, padding: str = "constant") -> tuple[Array, ...]:
+    """Return rows (T, …) in blocks of at most so many steps, the last one padded.
+
+    Args:
+        padding: "constant", zeros, or "edge", the last row again.
+    """
     steps = len(rows[0])
     count = -(-steps // most)
     size = -(-steps // count)
     padded = (
-        jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1))) for part in rows
+        jnp.pad(part, ((0, count * size - steps), *((0, 0),) * (part.ndim - 1)), padding)
+        for part in rows
     )
     return tuple(part.reshape(count, size, *part.shape[1:]) for part in padded)
 
 
-def _steps_at_once(
+def _by_blocks(
     most: int, dynamics: Any, numbers: Numbers, carry: Any, rows: Any, weight: Array
 ) -> tuple[Any, Any]:
     """Return Gram matrices of one chunk, a block of steps at a time.
@@ -311,7 +328,7 @@ def _steps_at_once(
         state, states = jax.lax.scan(
             lambda state, row: (side_by_side(state, row), state), state, inputs
         )
-        steps = dynamics.local(numbers, _flatten(states), _flatten(inputs))
+        steps = dynamics.local(numbers, flatten_steps(states), flatten_steps(inputs))
         value, to_state, to_unknowns = (
             part.reshape(*part.shape[:-1], size, width) for part in steps
         )
@@ -328,10 +345,11 @@ def _steps_at_once(
         columns = _columns(scored, slope, jnp.moveaxis(target, 0, -2), value[n0:], weight)
         return (state, slopes, *_with_sums(shared, own, columns, n0)), None
 
-    return jax.lax.scan(block, carry, _cut(rows, most))[0][2:]
+    return jax.lax.scan(block, carry, cut_steps(rows, most))[0][2:]
 
 
-def _flatten(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
+def flatten_steps(part: Float[Array, "T n m"]) -> Float[Array, "n T*m"]:
+    """Return steps of segments side by side."""
     steps, n, m = part.shape
     return jnp.moveaxis(part, 0, 1).reshape(n, steps * m)  # n = 0 of a motion without inputs
 
