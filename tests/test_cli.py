@@ -92,7 +92,7 @@ def run(*arguments: object) -> Done:
     ):
         patch.setattr(sys, "argv", ["orthaug", *map(str, arguments)])
         patch.setattr(
-            "orthaug._base.jax.use_compilation_cache", lambda: None
+            "orthaug._base.jax.keep_programs", lambda: None
         )  # the cache on disk is tested by subprocesses
         with pytest.raises(SystemExit) as stop:
             cli.main()

@@ -37,13 +37,14 @@ import sys
 import threading
 import time
 import numpy as np
-from orthaug._base.jax import jax, use_compilation_cache
-use_compilation_cache()
+import orthaug as oa
+from orthaug._base.jax import jax
+jax.jit(lambda x: x + 1)(1.0)  # a program that was compiled before
+print(oa.keep_programs())
 traced = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda event, seconds, **_: traced.append(seconds) if "trace_duration" in event else None
 )
-import orthaug as oa
 rng = np.random.default_rng(1)
 u = np.repeat(rng.normal(size=20), 10)
 v, y = 0.0, []
@@ -89,7 +90,8 @@ def fitted(folder: Path, seed: str) -> tuple[float, str]:
         text=True,
         check=True,
     )
-    seconds, numbers = made.stdout.splitlines()
+    kept, seconds, numbers = made.stdout.splitlines()
+    assert kept == str(folder)
     return float(seconds), numbers
 
 
@@ -98,6 +100,7 @@ def test_the_next_process_traces_nothing_and_gets_the_same_numbers(tmp_path: Pat
     kept = {path.name for path in tmp_path.glob("orthaug_*-cache")}
     again, same = fitted(tmp_path, "2")
     assert len(kept) > 5
+    assert len({path.name for path in tmp_path.glob("*-cache")} - kept) > 5  # compiled ones
     assert {path.name for path in tmp_path.glob("orthaug_*-cache")} == kept
     assert same == numbers
     assert again < 0.3 * first

@@ -1,6 +1,7 @@
 from ._base import InputError as InputError
 from ._base import RankError as RankError
 from ._base import TrainingError as TrainingError
+from ._base.jax import keep_programs as keep_programs
 from .analysis import Linearization as Linearization
 from .analysis import MotionSuspect as MotionSuspect
 from .analysis import Observer as Observer

@@ -54,11 +54,11 @@ __all__ = [
     "is_traced",
     "jax",
     "jnp",
+    "keep_programs",
     "padded_length",
     "release_programs",
     "quick_jit",
     "starts",
-    "use_compilation_cache",
 ]
 
 
@@ -327,19 +327,30 @@ def release_programs(share: float = _MOST_MAPS) -> bool:
     return True
 
 
-def use_compilation_cache() -> None:
-    """Keep compiled programs between processes.
+def keep_programs(folder: str | Path | None = None) -> Path:
+    """Keep compiled programs for later processes, and return the folder where they are kept.
 
-    The command line does; the library never does on its own.
+    A script that is run again then starts faster: most of what its first fit takes is compiling.
+    The command line does this by itself; from Python nothing is kept without it. Call it before
+    the first fit; programs that were compiled earlier are not kept. It is a setting of JAX in the
+    whole process.
+
+    Args:
+        folder: by default that of `JAX_COMPILATION_CACHE_DIR`, else the user's folder for caches,
+            which the command line uses, too. Removing it costs a slower start and nothing else.
     """
     import platformdirs
+    from jax.experimental.compilation_cache import compilation_cache
 
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
-    jax.config.update("jax_compilation_cache_dir", folder)
+    place = os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_dir("orthaug")
+    place = str(folder or place)
+    jax.config.update("jax_compilation_cache_dir", place)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    compilation_cache.reset_cache()  # JAX asks once whether there is one
     _check_cached_programs()
-    keep_traced_programs(folder)
+    keep_traced_programs(place)
+    return Path(place)
 
 
 _kept: list[KeptPrograms] = []  # one where traced programs are kept

@@ -442,6 +442,6 @@ def arguments(command: str, *read: Path, **options: object) -> tuple[str, ...]:
 
 def prepare_jax() -> None:
     """Keep compiled programs for the next command."""
-    from orthaug._base.jax import use_compilation_cache
+    from orthaug._base.jax import keep_programs
 
-    use_compilation_cache()
+    keep_programs()

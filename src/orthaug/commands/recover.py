@@ -223,13 +223,13 @@ def _start(job: Job, asked: Asked, store: Path, share: tuple[int, int]) -> subpr
 
 def work() -> None:
     """Make the share of the draws that the first argument of the process describes."""
-    from orthaug._base.jax import use_compilation_cache
+    from orthaug._base.jax import keep_programs
 
     given = json.loads(sys.argv[1])
     asked, job = Asked(**given["asked"]), open_job(Path(given["path"]))
     if job.fingerprint != given["fingerprint"]:
         sys.exit(2)  # the file has changed since: the one that asked makes these draws
-    use_compilation_cache()
+    keep_programs()
     with one_blas_thread():
         study = _study(plan_for(job, asked), asked, tuple(given["share"]))
         runs(study, store=Path(given["store"]), workers=1)

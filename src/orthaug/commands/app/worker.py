@@ -191,9 +191,9 @@ def examine(path: str, whole: bool) -> dict[str, object]:
     answer: dict[str, object] = {"check": None, "refusal": None, "bias": []}
     if whole or not runs:
         if runs:
-            from orthaug._base.jax import use_compilation_cache
+            from orthaug._base.jax import keep_programs
 
-            use_compilation_cache()
+            keep_programs()
         result = check_job(job)
         refused = job.physics.refusal(job, result)
         bias = [
@@ -244,10 +244,10 @@ def starts(path: str) -> dict[str, object]:
     The physics alone is fitted to the first rows in segments that lengthen: short ones find
     parameters that are far from where they begin.
     """
-    from orthaug._base.jax import use_compilation_cache
+    from orthaug._base.jax import keep_programs
     from orthaug.fitting.criteria import Simulation
 
-    use_compilation_cache()
+    keep_programs()
     place = Path(path)
     spec = with_value(place.read_text("utf-8"), ("training", "iterations"), _START_ITERATIONS)
     values: dict[str, float] = {}
