@@ -143,3 +143,12 @@ def test_other_jumps_are_no_resets(case):
     else:
         way = way + 0.3 * rng.standard_t(2, size=800)
     assert not find_resets(way, force[:, None])
+
+
+def test_a_step_beside_others_of_rounding_size_overflows_nothing():
+    """A sensor at rest whose noise is below any number: the ratio of its steps is no number."""
+    samples = np.zeros(400)
+    samples[::2] = 5e-324
+    samples[200:] += 100.0
+    with np.errstate(over="raise"):
+        assert find_resets(samples, np.zeros((400, 1))) == [199]

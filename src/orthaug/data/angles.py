@@ -96,7 +96,9 @@ def find_resets(samples: Vector, inputs: Matrix) -> list[int]:
     most = max(1, int(_FEW * len(steps)))
     order = np.argsort(-steps)
     sizes = steps[order[: most + 1]]
-    count = int(np.argmax(sizes[:-1] / np.maximum(sizes[1:], np.finfo(float).tiny))) + 1
+    with np.errstate(over="ignore"):  # steps that are 0 but for rounding
+        ratios = sizes[:-1] / np.maximum(sizes[1:], np.finfo(float).tiny)
+    count = int(np.argmax(ratios)) + 1
     if not sizes[count] > 0 or sizes[count - 1] < _APART * sizes[count]:
         return []
     rows = np.sort(order[:count])
