@@ -91,6 +91,34 @@ def test_a_two_link_arm_has_the_accelerations_of_lagrange(tmp_path: Path) -> Non
     np.testing.assert_array_equal(motion.observed(x, u, p, np), x[:2])
 
 
+def test_a_learner_of_torques_has_the_mass_matrix_of_lagrange(tmp_path: Path) -> None:
+    keys = {"file": write(tmp_path, ARM), "parameters": ("lower.mass",)}
+    motion = MuJoCo(**keys, learned=("shoulder.torque", "elbow_torque")).build(
+        ["first", "second"], ["shoulder", "elbow"]
+    )
+    assert motion.learned == ((2, 3), ())
+    assert motion.mass.forces == (("shoulder_torque", "N m"), ("elbow_torque", "N m"))
+    x, p = np.array([0.4, 0.9, -0.3, 0.7]), np.array([1.1])
+    first, second = (
+        np.append(x[2:], arm(x, torque, 1.1, 0.2, 1.0)) for torque in ([1.0, 0.0], [0.0, 0.0])
+    )
+    force = motion.mass.balance(first - second, x, p)
+    np.testing.assert_allclose(force, [0, 0, 1, 0], rtol=1e-8, atol=1e-10)
+    rates = MuJoCo(**keys, learned=("shoulder.velocity",)).build(["first"], ["shoulder"])
+    assert rates.learned == ((2,), ()) and not rates.mass.rows
+    with pytest.raises(InputError, match="`learned` has elbow.torque, a force, and shoulder.vel"):
+        MuJoCo(**keys, learned=("elbow.torque", "shoulder.velocity")).build(["first"], ["elbow"])
+
+
+def test_a_slide_has_a_force(tmp_path: Path) -> None:
+    source = MuJoCo(
+        file=write(tmp_path, CART), parameters=("pole.mass",), learned=("slider.force",)
+    )
+    motion = source.build(["push"], ["slider"])
+    assert motion.learned == ((2,), ())
+    assert motion.mass.forces == (("slider_force", "N"), ("hinge_torque", "N m"))
+
+
 @pytest.mark.proof
 def test_a_cart_pole_is_fitted_saved_and_written_back(tmp_path: Path) -> None:
     names = ("pole.mass", "hinge.damping")

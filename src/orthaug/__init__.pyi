@@ -84,6 +84,7 @@ from .models.learners import External as External
 from .models.learners import Function as Function
 from .physics import Baseline as Baseline
 from .physics import Controller as Controller
+from .physics import MassMatrix as MassMatrix
 from .physics import Motion as Motion
 from .physics import Output as Output
 from .physics import Parameter as Parameter

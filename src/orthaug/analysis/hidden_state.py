@@ -331,6 +331,7 @@ class _OfStates:
     """The equations of a motion: those of its states."""
 
     form: MotionDynamics
+    parameters: Vector
     one_step: None = None  # the noise of outputs does not enter its equations
 
     def signals(self, run: LinearRun) -> dict[str, Vector]:
@@ -368,20 +369,24 @@ class _OfStates:
             into_state[:, place] = columns
         else:
             half = run.steps[:, None] / 2
-            into_state += half[..., None] * run.to_state[:, :, place, None] * columns[:, None]
-            into_state[:, place] += half * np.concatenate([columns[1:], columns[-1:]])
+            entries = self.form.motion.mass.entries(run.states, self.parameters)
+            acting = entries[:, :, place, None] * columns[:, None]
+            into_state += half[..., None] * (run.to_state @ acting)
+            into_state += half[..., None] * np.concatenate([acting[1:], acting[-1:]])
         return into_state, into_output
 
 
-_EQUATIONS_OF: dict[type, Callable[[Any], _OfOutputs | _OfStates]] = {
-    LaggedDynamics: _OfOutputs,
-    MotionDynamics: _OfStates,
+_EQUATIONS_OF: dict[type, Callable[[Model], _OfOutputs | _OfStates]] = {
+    LaggedDynamics: lambda model: _OfOutputs(model.form),
+    MotionDynamics: lambda model: _OfStates(
+        model.form, np.asarray(model.form.parameters(model.numbers))
+    ),
 }
 
 
 def _equations(model: Model) -> _OfOutputs | _OfStates:
     """Return the equations of a model to which terms may be added."""
-    return _EQUATIONS_OF[type(model.form)](model.form)
+    return _EQUATIONS_OF[type(model.form)](model)
 
 
 def _respond(model: Model, run: LinearRun, place: int, columns: Matrix) -> np.ndarray:

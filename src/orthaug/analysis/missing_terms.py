@@ -377,19 +377,20 @@ def doubted_equations(fit: MotionEstimate) -> tuple[tuple[int, ...], tuple[int, 
     Equations of outputs are counted behind those of states. Others of states, such as ẋ = v, define
     a state. All states, if there is none with a parameter.
     """
-    motion, (x, u, p) = fit.problem.motion, _along(fit)
+    motion, (x, u, own) = fit.problem.motion, _along(fit)
     nx, ny = len(motion.states), len(motion.outputs)
     moved = {*motion.learned[0], *(nx + j for j in motion.learned[1])}
 
     def values(point: Vector, row: Vector, p: Vector) -> Vector:
-        rates = np.asarray(motion.rates(point, row, p, np))
+        rates = np.asarray(motion.mass.balance(motion.rates(point, row, p, np), point, own))
         return np.concatenate([rates, np.asarray(motion.observed(point, row, p, np))])
 
     with np.errstate(all="ignore"):
         for point, row in zip(x, u, strict=True):
-            here = values(point, row, p)
-            for i in range(len(p)):
-                there = p + _MOVED * np.where(p != 0, np.abs(p), 1.0) * (np.arange(len(p)) == i)
+            here = values(point, row, own)
+            for i in range(len(own)):
+                step = _MOVED * np.where(own != 0, np.abs(own), 1.0)
+                there = own + step * (np.arange(len(own)) == i)
                 moved |= set(np.flatnonzero(values(point, row, there) != here).tolist())
     if not any(i < nx for i in moved):
         moved |= set(range(nx))

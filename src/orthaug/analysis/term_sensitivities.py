@@ -105,9 +105,7 @@ def sensitivities(
         )
         p = form.motion.coordinates.physical(np.asarray(numbers.c))
         acting = [
-            tuple(input_slopes(form.motion, one, p, i) for one in (rows, ends))
-            if i >= n0 + target.shape[2]
-            else None
+            None if n0 <= i < n0 + target.shape[2] else _acting(form.motion, i, p, (rows, ends))
             for i in equations
         ]
         pace = 1.0 if segmented.record.even else form.split_pace(u)[1]
@@ -117,6 +115,15 @@ def sensitivities(
     if not kept[scored].all():
         return None
     return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
+
+
+def _acting(motion: Motion, i: int, p: Vector, at: Sequence[Matrix]) -> tuple[Matrix, ...]:
+    """Return ∂ẋ (…, nx) by what is added to the equation of a state, or to an input, at rows."""
+    nx = len(motion.states)
+    if i >= nx:
+        return tuple(input_slopes(motion, one, p, i) for one in at)
+    found = (motion.mass.entries(one.reshape(-1, one.shape[-1])[:, :nx], p)[..., i] for one in at)
+    return tuple(part.reshape(*one.shape[:-1], nx) for part, one in zip(found, at, strict=True))
 
 
 def input_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matrix:
@@ -182,7 +189,7 @@ def _propagate(
     The terms act by the trapezoidal rule: `added` at the begin of a sample, `at_ends` at its end.
 
     Args:
-        acting: for an input, its slopes (m, T, n0) there.
+        acting: ∂ẋ (m, T, n0) by a term there; None where it acts on an output.
         halves: of the seconds (m, T) that each step takes.
     """
     m, steps, n0, own = to_next.shape
@@ -201,21 +208,14 @@ def _propagate(
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
         now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
         half = halves[:, k, None, None]
-        for place, i in enumerate(equations):
-            to, by = slice(own + place * q, own + (place + 1) * q), acting[place]
-            if by is not None:
-                begin, end = (one[:, k, :, None] for one in by)  # (m, n0, 1)
-                if form.motion.scheme.discrete:
-                    slope[:, :, to] += begin * now[:, None]
-                    continue
-                slope[:, :, to] += half * (a @ begin) * now[:, None]
-                slope[:, :, to] += half * end * then[:, None]
+        for place, by in enumerate(acting):
+            to = slice(own + place * q, own + (place + 1) * q)
+            if by is None:  # an output
                 continue
-            if i >= n0:
-                continue
+            begin, end = (one[:, k, :, None] for one in by)  # (m, n0, 1)
             if form.motion.scheme.discrete:
-                slope[:, i, to] += now
+                slope[:, :, to] += begin * now[:, None]
                 continue
-            slope[:, :, to] += half * a[:, :, i, None] * now[:, None]
-            slope[:, i, to] += half[:, 0] * then
+            slope[:, :, to] += half * (a @ begin) * now[:, None]
+            slope[:, :, to] += half * end * then[:, None]
     return columns

@@ -17,6 +17,7 @@ from collections.abc import Container, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -485,3 +486,22 @@ def _unknown_name(name: str, text: str, constants: Mapping[str, float]) -> str:
         or f"; declare it with its value, or, for a channel, give its lag, {name}[k-1]."
     )
     return f"'{text}': unknown constant '{name}'{hint}"
+
+
+def in_order(definitions: Mapping[str, Expression]) -> list[str]:
+    """Return the names of definitions in an order in which each follows those that it uses.
+
+    Raises:
+        InputError: definitions that need each other.
+    """
+    uses = {
+        name: [other for other in given.names if other in definitions]
+        for name, given in definitions.items()
+    }
+    try:
+        return list(TopologicalSorter(uses).static_order())
+    except CycleError as error:
+        loop = " → ".join(reversed(error.args[1]))
+        raise InputError(
+            f"motion.define: an algebraic loop, {loop}; no definition may need itself."
+        ) from None

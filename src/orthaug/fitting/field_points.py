@@ -64,7 +64,8 @@ def sizes_learned(segmented: SegmentedMotion, c: Vector, x: Matrix, u: Matrix) -
     """Return the size (nl,) of each learned equation and output over the runs."""
     motion = segmented.problem.motion
     with np.errstate(all="ignore"):
-        rates = np.asarray(motion.rates(x.T, u.T, motion.coordinates.physical(c), np), dtype=float)
+        p = motion.coordinates.physical(c)
+        rates = np.asarray(motion.mass.balance(motion.rates(x.T, u.T, p, np), x.T, p), dtype=float)
     if motion.scheme.discrete:
         rates = rates - x.T
     states, outputs = motion.learned

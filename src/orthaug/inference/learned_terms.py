@@ -121,7 +121,8 @@ def _targets(model: Model) -> list[tuple[str, str]]:
     states, outputs = motion.learned
     units = {channel.name: channel.unit for channel in model.outputs}
     rates = [
-        (motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "")
+        motion.mass.label(i)
+        or (motion.states[i].name, f"({motion.states[i].unit})/s" if motion.states[i].unit else "")
         for i in states
     ]
     return [

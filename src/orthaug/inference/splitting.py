@@ -445,9 +445,13 @@ def split_motion(
     return replace(split, slope=slope, defect=defect, share=share)
 
 
-def _learned_rows(form: MotionDynamics, q: AnyArray, x: Array, u: Array) -> Array:
-    """Return the physics of the learned equations and outputs (nl,) at one point."""
-    return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
+def _learned_rows(form: MotionDynamics, q: AnyArray, x: Array, u: Array, c: AnyArray) -> Array:
+    """Return the physics of the learned equations and outputs (nl,) at one point.
+
+    Forces are those of the mass matrix at c.
+    """
+    p, own = (form.motion.coordinates.physical(one, jnp) for one in (q, c))
+    return form.learned_rows(p, x, u, own)
 
 
 def rest_of(
@@ -462,9 +466,8 @@ def rest_of(
 ) -> Array:
     """Return (G − f(q)) / size (nl,) at one point."""
     own = numbers._replace(weights=w)
-    return (
-        _learned_rows(form, c, x, u) + form.learned(own, x, u) - _learned_rows(form, q, x, u)
-    ) / size
+    physics = _learned_rows(form, c, x, u, c) - _learned_rows(form, q, x, u, c)
+    return (physics + form.learned(own, x, u)) / size
 
 
 @partial(quick_jit, static_argnames="form")
@@ -475,9 +478,9 @@ def slopes_at(
 
     def value_and_slope(q: Array, x: Array, u: Array) -> Array:
         p = form.motion.coordinates.physical(q, jnp)
-        return jnp.concatenate(
-            [form.motion.rates(x, u, p, jnp), form.motion.observed(x, u, p, jnp)]
-        )
+        fixed = jax.lax.stop_gradient(p)
+        rates = form.motion.mass.balance(form.motion.rates(x, u, p, jnp), x, fixed)
+        return jnp.concatenate([rates, form.motion.observed(x, u, p, jnp)])
 
     return jax.vmap(lambda x, u: jax.jacfwd(value_and_slope)(q, x, u))(x, u)
 
@@ -552,7 +555,8 @@ def _second(
         slope = jax.jacfwd(lambda q: rest_of(form, numbers, q, c, w, x, u, size))(q)
         learner = jnp.sum((form.learned(numbers, x, u) / size) ** 2)
         rest = jnp.sum(rest_of(form, numbers, q, c, w, x, u, size) ** 2)
-        whole = jnp.sum(((_learned_rows(form, c, x, u) + form.learned(numbers, x, u)) / size) ** 2)
+        fitted = _learned_rows(form, c, x, u, c) + form.learned(numbers, x, u)
+        whole = jnp.sum((fitted / size) ** 2)
         return second, to_c, to_w, slope.T @ slope, downhill(q, c, w), learner, rest, whole
 
     found = jax.vmap(one)(x, u)

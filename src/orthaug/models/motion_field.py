@@ -147,30 +147,36 @@ class MotionField:
         x_in, u_in = x + moved[: len(x)], u + moved[len(x) :]
         split, own = (self.motion.coordinates.physical(q, jnp) for q in (numbers.theta, numbers.c))
         held = (
-            self.learned_rows(own, x_in, u_in)
-            - self.learned_rows(split, x_in, u_in)
+            self.learned_rows(own, x_in, u_in, own)
+            - self.learned_rows(split, x_in, u_in, own)
             + self._values(numbers, inside)
         )
-        beyond = self.learned_rows(split, x, u) - self.learned_rows(own, x, u) + share * held
+        beyond = self.learned_rows(split, x, u, own) - self.learned_rows(own, x, u, own)
+        beyond = beyond + share * held
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
-    def learned_rows(self, p: Array, x: Array, u: Array) -> Array:
+    def learned_rows(self, p: Array, x: Array, u: Array, own: Array) -> Array:
         """Return the physics of the learned equations (nl,), then of the learned outputs.
 
-        p are the parameters.
+        p are the parameters; `own` those of the mass matrix, if there is one.
         """
         states, outputs = (np.array(rows, dtype=int) for rows in self.motion.learned)
-        rates, observed = self.motion.rates(x, u, p, jnp), self.motion.observed(x, u, p, jnp)
-        return jnp.concatenate([rates[states], observed[outputs]])
+        rates = self.motion.mass.balance(self.motion.rates(x, u, p, jnp), x, own)
+        return jnp.concatenate([rates[states], self.motion.observed(x, u, p, jnp)[outputs]])
 
     def rates(self, numbers: Numbers, x: Array, u: Array) -> tuple[Any, Any]:
         """Return the equations' right-hand sides of physics and learner, each (nx,)."""
-        physics = self.motion.rates(x, u, self.parameters(numbers), jnp)
-        learned = jnp.zeros(self.states)
+        p = self.parameters(numbers)
+        physics = self.motion.rates(x, u, p, jnp)
         states, _ = self.corrected
-        if states:
-            learned = learned.at[np.array(states)].set(self.addition(numbers, x, u)[: len(states)])
-        return physics, learned
+        if not states:
+            return physics, jnp.zeros(self.states)
+        return physics, self.rates_of(self.addition(numbers, x, u)[: len(states)], x, p)
+
+    def rates_of(self, learned: Array, x: Array, p: Array) -> Any:
+        """Return what ẋ (nx,) grows by where `learned` (nl,) is added to the learned equations."""
+        rows = jnp.zeros(self.states).at[np.array(self.corrected[0])].set(learned)
+        return self.motion.mass.rates(rows, x, p)
 
     def observed(self, numbers: Numbers, x: Array, u: Array) -> Array:
         """Return y (ny,)."""
@@ -235,6 +241,9 @@ def labels_of(form: MotionField) -> tuple[tuple[str, str], ...]:
     rates = []
     for i in states:
         state = motion.states[i]
+        if force := motion.mass.label(i):
+            rates.append(force)
+            continue
         following = motion.scheme.discrete
         unit = state.unit if following else _rate(state.unit)
         rates.append((f"next {state.name}" if following else f"d{state.name}/dt", unit))
@@ -249,8 +258,10 @@ def _rate(unit: str) -> str:
 def _parts(
     form: MotionField, numbers: Numbers, x: Float[Array, "m nx"], u: Float[Array, "m nu"]
 ) -> tuple[Float[Array, "m nl"], Float[Array, "m nl"]]:
+    own = form.motion.coordinates.physical(numbers.c, jnp)
+
     def physics(q: Any, x: Array, u: Array) -> Array:
-        return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u)
+        return form.learned_rows(form.motion.coordinates.physical(q, jnp), x, u, own)
 
     def at(x: Array, u: Array) -> tuple[Any, Any]:
         split = physics(numbers.theta, x, u)

@@ -54,12 +54,16 @@ class Slopes(NamedTuple):
 
 
 class FieldSlopes(NamedTuple):
-    """Value of F at m points, ∂F/∂x, ∂F/∂c, and what `Bound.backward` needs for ∂F/∂w."""
+    """Value of F at m points, ∂F/∂x, ∂F/∂c, and what `Bound.backward` needs for ∂F/∂w.
+
+    `to_g` is ∂F/∂g by the learner's values under a mass matrix, and None where they are rates.
+    """
 
     value: Any
     to_x: Any
     to_c: Any
     kept: Any
+    to_g: Any
 
 
 def sample_slopes(
@@ -129,15 +133,19 @@ def _back(
     and the slopes by c and w grow by Σ ψ_s ∂F_s/∂c and Σ ψ_s ∂F_s/∂w.
     """
     learned = form.corrected[0]
+    each = range(len(learned))
 
-    def before(sums: tuple[Array, ...], given: tuple[Array, ...]) -> tuple[Any, Array]:
-        (adjoint, to_x, to_c), (own, ahead, next_to_x, stage_to_x, stage_to_c) = sums, given
+    def before(sums: tuple[Array, ...], given: tuple[Any, ...]) -> tuple[Any, Array]:
+        (adjoint, to_x, to_c), (own, ahead, next_to_x, stage_to_x, stage_to_c, to_g) = sums, given
         adjoint = h * (own * after.to_x + ahead * _product(adjoint, next_to_x))
         sums = adjoint, to_x + _product(adjoint, stage_to_x), to_c + _product(adjoint, stage_to_c)
-        return sums, _learner_rows(form, numbers, adjoint, learned, 0) if learned else adjoint
+        if not learned:
+            return sums, adjoint
+        rows, places = (adjoint, learned) if to_g is None else (_product(adjoint, to_g), each)
+        return sums, _learner_rows(form, numbers, rows, places, 0)
 
     weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6, jnp.array([0.5, 0.5, 1.0, 0.0])
-    given = (*weights, jnp.roll(stages.to_x, -1, axis=0), stages.to_x, stages.to_c)
+    given = (*weights, jnp.roll(stages.to_x, -1, axis=0), *stages[1:3], stages.to_g)
     begun = after.to_x, after.to_x, after.to_c
     (_, to_x, to_c), rows = over_stages(before, begun, given, reverse=True)
     to_w = after.to_w
@@ -172,14 +180,37 @@ def field_slopes(
     form: MotionField, numbers: Numbers, x: Float[Array, "nx m"], u: Float[Array, "nu m"]
 ) -> FieldSlopes:
     """Return F and its slopes at m points."""
-    states = form.corrected[0]
-    value, to_x, to_c = _physics_slopes(form, form.motion.rates, numbers.c, x, u)
+    states, motion = form.corrected[0], form.motion
+    if states and motion.mass.rows:
+        kept, *learned = learner_slopes(form, numbers, x, u)
+        g, g_to_x = (part[: len(states)] for part in learned)
+        return _force_slopes(form, numbers, kept, g, g_to_x, x, u)
+    value, to_x, to_c = _physics_slopes(form, motion.rates, numbers.c, x, u)
     to_x, to_c = _finite(to_x), _finite(to_c)
     if not states:
-        return FieldSlopes(value, to_x, to_c, ())
+        return FieldSlopes(value, to_x, to_c, (), None)
     kept, g, g_to_x = learner_slopes(form, numbers, x, u)
     value, to_x = (_add_to_rows(a, states, b) for a, b in ((value, g), (to_x, g_to_x)))
-    return FieldSlopes(value, to_x, to_c, kept)
+    return FieldSlopes(value, to_x, to_c, kept, None)
+
+
+def _force_slopes(
+    form: MotionField, numbers: Numbers, kept: Any, g: Array, g_to_x: Array, x: Array, u: Array
+) -> FieldSlopes:
+    """Return f + M⁻¹ g and its slopes, of forces g (nl, m) and ∂g/∂x (nl, nx, m)."""
+    motion, n = form.motion, form.states
+
+    def at(x: Array, u: Array, g: Array) -> tuple[Any, Any, Any]:
+        def values(point: Array, c: Array) -> Array:
+            p = motion.coordinates.physical(c, jnp)
+            rates = motion.rates(point[:n], u, p, jnp)
+            return rates + form.rates_of(point[n:], point[:n], p)
+
+        return _differentiate(values, jnp.concatenate([x, g]), numbers.c, motion)
+
+    value, to_both, to_c = jax.vmap(at, -1, -1)(x, u, g)
+    to_x, to_g = _finite(to_both[:, :n]), _finite(to_both[:, n:])
+    return FieldSlopes(value, to_x + _product(to_g, g_to_x), _finite(to_c), kept, to_g)
 
 
 def learner_slopes(

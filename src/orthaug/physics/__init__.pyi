@@ -3,6 +3,7 @@ from .baseline import Parameter as Parameter
 from .baseline import Term as Term
 from .controller import Controller as Controller
 from .excitation import identifiability as identifiability
+from .mass_matrix import MassMatrix as MassMatrix
 from .motion import Motion as Motion
 from .parameters import PhysicalParameter as PhysicalParameter
 from .parameters import PhysicsMap as PhysicsMap

@@ -17,6 +17,7 @@ import numpy as np
 
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
+from orthaug.physics.mass_matrix import MassMatrix
 from orthaug.physics.sources import Description, FileSource, Functions, Quantity, Seen
 
 _OPERATIONS = 1000  # of a step, roughly: large programs are written once into a loop
@@ -43,7 +44,9 @@ class MuJoCo(FileSource):
     its inertia is a parameter of its own.
 
     Args:
-        file, parameters, inputs, outputs, starts, learned: as of a `FileSource`.
+        file, parameters, inputs, outputs, starts, learned: as of a `FileSource`. `joint.torque` in
+            `learned`, or `joint.force` of a slide, is what the joint's actuator would add;
+            `joint.velocity` its acceleration.
         integrator, substeps, hold: of the motion.
 
     Examples:
@@ -75,7 +78,9 @@ class MuJoCo(FileSource):
             for name, at in there.places.items()
         )
         inputs = tuple(Quantity(name) for name in there.names("actuator"))
-        return Description(states, parameters, inputs, states)
+        forces = zip(states[len(names) :], there.forces, strict=True)
+        pushed = tuple((state.name, Quantity(*force)) for state, force in forces)
+        return Description(states, parameters, inputs, states, pushed)
 
     def functions(
         self, parameters: Sequence[str], inputs: Sequence[str], outputs: Sequence[str]
@@ -85,6 +90,13 @@ class MuJoCo(FileSource):
         actuators = tuple(self.mechanism.names("actuator").index(name) for name in inputs)
         seen = tuple(states.index(name) for name in outputs)
         return Rates(self.mechanism, own, actuators), Seen(seen)
+
+    def mass(self, parameters: Sequence[str]) -> MassMatrix:
+        there = self.mechanism
+        count = len(there.forces)
+        own = Inertia(there, tuple(there.places[name] for name in parameters))
+        forces = tuple((Quantity(name).identifier, unit) for name, unit in there.forces)
+        return MassMatrix(own, tuple(range(count, 2 * count)), forces)
 
     def written(self, values: Mapping[str, float]) -> dict[str, str]:
         """Return the file with these values, `model.xml`."""
@@ -115,6 +127,16 @@ class Mechanism:
         mujoco, _ = _modules(self.file)
         slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
         return [int(kind) == slide for kind in self.compiled.jnt_type]
+
+    @property
+    def forces(self) -> list[tuple[str, str]]:
+        """Name and unit of the force along each joint."""
+        words = {True: ("force", "N"), False: ("torque", "N m")}
+        kinds = (words[slides] for slides in self.slides)
+        return [
+            (f"{n}.{word}", unit)
+            for n, (word, unit) in zip(self.names("joint"), kinds, strict=True)
+        ]
 
     @property
     def rest(self) -> Any:
@@ -227,12 +249,8 @@ class Rates:
     def at(self, x: Any, u: Any, p: Any) -> Any:
         """Return ẋ (nx,) at one point of JAX arrays."""
         _, mjx = _modules(self.mechanism.file)
-        model, data = _on_jax(self.mechanism)
-        changes: dict[str, Any] = {}
-        for place, value in zip(self.parameters, p, strict=True):
-            array = changes.get(place.array, getattr(model, place.array))
-            changes[place.array] = array.at[place.index].set(value)
-        model, half = model.replace(**changes), len(x) // 2
+        model, data = _changed(self.mechanism, self.parameters, p)
+        half = len(x) // 2
         ctrl = jnp.zeros(self.mechanism.compiled.nu).at[np.array(self.actuators, int)].set(u)
         data = data.replace(qpos=x[:half], qvel=x[half:], ctrl=ctrl)
         if self.mechanism.constrained:
@@ -240,6 +258,30 @@ class Rates:
         data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
         data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
         return jnp.concatenate([x[half:], data.qacc_smooth])
+
+
+@dataclass(frozen=True)
+class Inertia:
+    """M(x, p) of a mechanism's joints, in the order of their velocities."""
+
+    mechanism: Mechanism
+    parameters: tuple[Place, ...]
+
+    def __call__(self, x: Any, p: Any) -> Any:
+        _, mjx = _modules(self.mechanism.file)
+        model, data = _changed(self.mechanism, self.parameters, p[: len(self.parameters)])
+        data = data.replace(qpos=x[: self.mechanism.compiled.nq])
+        return mjx.full_m(model, mjx.fwd_position(model, data))
+
+
+def _changed(mechanism: Mechanism, parameters: Sequence[Place], p: Any) -> tuple[Any, Any]:
+    """Return the model of MJX with other values of parameters (np,), and its data."""
+    model, data = _on_jax(mechanism)
+    changes: dict[str, Any] = {}
+    for place, value in zip(parameters, p, strict=True):
+        array = changes.get(place.array, getattr(model, place.array))
+        changes[place.array] = array.at[place.index].set(value)
+    return model.replace(**changes), data
 
 
 @cache

@@ -10,7 +10,6 @@ import ast
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 import numpy as np
@@ -28,10 +27,18 @@ from orthaug._base.checks import (
 from orthaug._base.errors import InputError, show
 from orthaug._base.jax import ArrayModule
 from orthaug._base.views import NotebookView
-from orthaug.data.expressions import FUNCTIONS, SAMPLING_TIME, Expression, is_name, parse_named
+from orthaug.data.expressions import (
+    FUNCTIONS,
+    SAMPLING_TIME,
+    Expression,
+    in_order,
+    is_name,
+    parse_named,
+)
 from orthaug.data.record import Record
 from orthaug.physics.baseline import check_sampling_constant
 from orthaug.physics.integrators import INTEGRATORS, Integrator
+from orthaug.physics.mass_matrix import NO_MASS, MassMatrix
 from orthaug.physics.parameters import (
     Coordinates,
     PhysicalParameter,
@@ -78,6 +85,8 @@ class Motion(NotebookView):
     """f(x, u, p) and h(x, u, p) on JAX arrays, instead of expressions."""
     source: Origin | None = field(default=None, compare=False, repr=False)
     """Where the functions come from, so that a saved model finds them again."""
+    mass: MassMatrix = NO_MASS
+    """Where what is added to the equations are forces."""
 
     @property
     def scheme(self) -> Integrator:
@@ -152,7 +161,9 @@ class Motion(NotebookView):
             name: parse_named(text, everything, f"motion.define '{name}'")
             for name, text in define.items()
         }
-        motion = replace(plain, definitions=tuple((name, parsed[name]) for name in _order(parsed)))
+        motion = replace(
+            plain, definitions=tuple((name, parsed[name]) for name in in_order(parsed))
+        )
         for state in plain.states:
             if state.derivative is None:
                 raise InputError(
@@ -181,13 +192,18 @@ class Motion(NotebookView):
         integrator: str = "auto",
         substeps: int | None = None,
         hold: str = "zero-order",
+        mass: MassMatrix = NO_MASS,
     ) -> Motion:
         """Return a motion of JAX functions f(x, u, p) → (nx,) and h(x, u, p) → (ny,).
 
         The vectors are states, inputs and parameters.
 
+        Args:
+            mass: where a learner adds forces rather than rates.
+
         Raises:
-            InputError: names that cannot be, or what is no function.
+            InputError: names that cannot be, or what is no function; a discrete motion with a mass
+                matrix.
         """
         for name, function in (("f", f), ("h", h)):
             if not callable(function):
@@ -199,7 +215,8 @@ class Motion(NotebookView):
         plain = cls._from_declared(
             states, outputs, inputs, parameters, {}, integrator, substeps, hold
         )
-        return replace(plain, functions=(f, h))
+        mass.check(len(plain.states), plain.scheme.discrete)
+        return replace(plain, functions=(f, h), mass=mass)
 
     @classmethod
     def _from_declared(
@@ -623,25 +640,6 @@ class Motion(NotebookView):
 def _sampled(function: Any, step: float) -> Callable[..., Any]:
     """Return a function with the time [s] between samples, if it has a use for it."""
     return function.sampled(step) if hasattr(function, "sampled") else function
-
-
-def _order(definitions: Mapping[str, Expression]) -> list[str]:
-    """Return the names in an order in which each follows those that it uses.
-
-    Raises:
-        InputError: definitions that need each other.
-    """
-    uses = {
-        name: [other for other in given.names if other in definitions]
-        for name, given in definitions.items()
-    }
-    try:
-        return list(TopologicalSorter(uses).static_order())
-    except CycleError as error:
-        loop = " → ".join(reversed(error.args[1]))
-        raise InputError(
-            f"motion.define: an algebraic loop, {loop}; no definition may need itself."
-        ) from None
 
 
 def _stack(equations: Sequence[Expression], values: Mapping[str, Any], x: Any, xp: Any) -> Any:

@@ -23,6 +23,7 @@ from orthaug._base.checks import check_type, is_number, nearest
 from orthaug._base.errors import InputError, show
 from orthaug._base.registry import LIBRARY_ONLY
 from orthaug.data.record import Record
+from orthaug.physics.mass_matrix import NO_MASS, MassMatrix
 from orthaug.physics.motion import Motion
 from orthaug.physics.parameters import PhysicalParameter
 from orthaug.physics.states import Output, State
@@ -122,6 +123,8 @@ class Description:
     parameters: tuple[Quantity, ...]
     inputs: tuple[Quantity, ...]
     outputs: tuple[Quantity, ...]
+    forces: tuple[tuple[str, Quantity], ...] = ()
+    """What a learner may be instead of a state's rate, beside the name of the state."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,7 @@ class FileSource(PhysicsSource):
         outputs: the file's quantity by the name of a channel, where they differ.
         starts: of states: a number, an output channel, or "derivative of" one. By default an
             output that is the state, or else the file's own start.
-        learned: states and outputs that a learner is added to.
+        learned: states and outputs that a learner is added to; forces of a mechanism.
     """
 
     file: str
@@ -182,6 +185,10 @@ class FileSource(PhysicsSource):
     ) -> Functions:
         """Return f(x, u, p) and h(x, u, p) for these quantities of the file, hashable."""
         raise NotImplementedError
+
+    def mass(self, parameters: Sequence[str]) -> MassMatrix:
+        """Return the mass matrix, for a learner that consists of forces."""
+        return NO_MASS
 
     def write_back(self, values: Mapping[str, float], units: Mapping[str, str]) -> dict[str, str]:
         """Return what is written of estimated parameters, as the content of files by name.
@@ -256,13 +263,13 @@ class FileSource(PhysicsSource):
                     raise InputError(f"{self.file}: no {what} channel '{name}'{hint}")
         entering = [self.find(self.inputs.get(n, n), there.inputs, "input") for n in inputs]
         measured = [self.find(self.outputs.get(n, n), there.outputs, "output") for n in outputs]
-        learned = self._learned(there, outputs)
+        learned, forced = self._learned(there, outputs)
         made = []
         for state in there.states:
             seen = next((n for n, q in zip(outputs, measured, strict=True) if q == state), None)
             start = self._starts(there).get(state.name, state.value if seen is None else seen)
             made.append(State(state.identifier, None, start, state.name in learned, state.unit))
-        names = ([q.name for q in group] for group in (chosen, entering, measured))
+        names = [[q.name for q in group] for group in (chosen, entering, measured)]
         return Motion.from_functions(
             *self.functions(*names),
             states=made,
@@ -278,6 +285,7 @@ class FileSource(PhysicsSource):
                 for q in chosen
             ],
             inputs=inputs,
+            mass=self.mass(names[0]) if forced else NO_MASS,
             **self.options,
         )
 
@@ -327,10 +335,24 @@ class FileSource(PhysicsSource):
             for name, start in self.starts.items()
         }
 
-    def _learned(self, there: Description, outputs: Sequence[str]) -> set[str]:
-        """Return the names of learned states, as in the file, and of learned outputs."""
+    def _learned(self, there: Description, outputs: Sequence[str]) -> tuple[set[str], bool]:
+        """Return the names of learned states, as in the file, and of learned outputs.
+
+        And whether the learner is forces.
+        """
         channels = [name for name in self.learned if name in outputs]
-        states = {q.identifier: q.name for q in there.states} | {q.name: "" for q in there.states}
-        own = [name for name in self.learned if name in states or name not in channels]
-        found = {self.find(name, there.states, "state").name for name in own}
-        return found | {name for name in channels if name not in states}
+        states = {q.name: q.name for q in there.states}
+        states |= {force.name: state for state, force in there.forces}
+        known = (*there.states, *(force for _, force in there.forces))
+        written = {q.identifier for q in known} | {q.name for q in known}
+        own = [name for name in self.learned if name in written or name not in channels]
+        found = [self.find(name, known, "state").name for name in own]
+        forces = [name for name in found if name not in {q.name for q in there.states}]
+        if forces and len(forces) < len(found):
+            other = next(name for name in found if name not in forces)
+            raise InputError(
+                f"{self.file}: `learned` has {forces[0]}, a force, and {other}, whose rate is "
+                "none; give forces alone, or states alone."
+            )
+        named = {states[name] for name in found}
+        return named | {name for name in channels if name not in written}, bool(forces)

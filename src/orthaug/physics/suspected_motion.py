@@ -91,7 +91,8 @@ class SuspectedMotion(Motion):
 
     def rates(self, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         rates = self._known.rates(x, u[: self._own], p[: self._count], xp)
-        return self._with_terms(rates, 0, (x, u, p), xp)
+        added = self._with_terms(xp.zeros_like(rates), 0, (x, u, p), xp)
+        return rates + xp.asarray(self.mass.rates(added, x, p[: self._count]))
 
     def observed(self, x: Any, u: Any, p: Any, xp: ArrayModule) -> Any:
         outputs = self._known.observed(x, u[: self._own], p[: self._count], xp)

@@ -230,6 +230,8 @@ class MotionResponse:
     weight: Matrix
     half: float
     """h/2; 0 of a discrete motion, where a term acts on the next state."""
+    entries: Float[np.ndarray, "M nx nx"]
+    """How terms in the equations enter the rates."""
 
     @classmethod
     def of(
@@ -245,12 +247,17 @@ class MotionResponse:
         """Return the system along states x (M, nx) and inputs u (M, nu), with the steps' rows."""
         steps, outputs = (np.asarray(part) for part in _derivatives(form, numbers, x, u, rows))
         half = 0.0 if form.motion.scheme.discrete else form.sampling_time / 2
-        return cls(np.nan_to_num(steps), weight @ np.nan_to_num(outputs), begins, weight, half)
+        entries = form.motion.mass.entries(x, np.asarray(form.parameters(numbers)))
+        steps, outputs = np.nan_to_num(steps), weight @ np.nan_to_num(outputs)
+        return cls(steps, outputs, begins, weight, half, np.nan_to_num(entries))
 
     def forward(self, terms: Float[np.ndarray, "M n k"]) -> Float[np.ndarray, "R k"]:
         """Return outputs for terms in all equations and then all outputs (n = nx + ny)."""
         count, nx, _ = self.steps.shape
-        moved, direct = terms[:, :nx], np.einsum("oi,mik->mok", self.weight, terms[:, nx:])
+        moved, direct = (
+            self.entries @ terms[:, :nx],
+            np.einsum("oi,mik->mok", self.weight, terms[:, nx:]),
+        )
         s, found = np.zeros((nx, terms.shape[2])), np.zeros_like(direct)
         for k in range(count):
             if self.begins[k]:
@@ -278,7 +285,7 @@ class MotionResponse:
             else:
                 found[k] += self.half * here
                 back = here
-        return np.concatenate([found, direct], axis=1)
+        return np.concatenate([self.entries.swapaxes(1, 2) @ found, direct], axis=1)
 
     def starts(self) -> Float[np.ndarray, "R s"]:
         """Return the effect of the states at the beginning of each segment."""
@@ -371,7 +378,14 @@ def _places(model: Model[MotionDynamics]) -> tuple[tuple[str, str], ...]:
     """Return name and unit of every learned equation, by its state, and of every learned output."""
     motion = model.form.motion
     states, outputs = motion.learned
-    names = [motion.states[i].name for i in states] + [motion.outputs[i].name for i in outputs]
+    forces = [motion.mass.label(i) for i in states]
+    names = [
+        *(
+            motion.states[i].name if force is None else force[0]
+            for i, force in zip(states, forces, strict=True)
+        ),
+        *(motion.outputs[i].name for i in outputs),
+    ]
     units = [unit for _, unit in labels_of(model.form)][: len(states)] + [
         model.outputs[i].unit for i in outputs
     ]

@@ -365,7 +365,8 @@ class MotionSystem:
             factor = term.expression.value(motion.values(x.T, u.T, p, np), np)
             values = np.concatenate(signals) * np.broadcast_to(factor, len(x))
         slopes = np.asarray(slopes_at(form.physics_only, self.fit.theta, x, u))[:, place]
-        both = np.concatenate([motion.rates(x.T, u.T, p, np), motion.observed(x.T, u.T, p, np)])
+        rates = np.asarray(motion.mass.balance(motion.rates(x.T, u.T, p, np), x.T, p))
+        both = np.concatenate([rates, motion.observed(x.T, u.T, p, np)])
         physics, learner, places = both[place], np.zeros(len(x)), learned_places(motion)
         if place in places and form.learns:
             learner = parts_at(form, model.numbers, x, u)[1][:, places.index(place)]
