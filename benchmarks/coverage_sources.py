@@ -77,6 +77,7 @@ class Case(NamedTuple):
     rows: int = 100
     noise: float = 0.01
     """Of the outputs, over their deviation."""
+    neurons: int = 3
 
 
 def fmu(plant: Plant, outputs: dict[str, str], learned: str) -> Callable[[Path], Any]:
@@ -170,9 +171,10 @@ CASES = {
         {"first": (-4, 4, 15), "second": (-0.5, 0.5, 10)},
         {"shoulder": 0, "elbow": 1},
         {"lower.mass": 0.9, "shoulder.damping": 0.3},
-        ("shoulder_velocity", "elbow"),
+        ("shoulder_velocity", "elbow_velocity"),
         0.02,
         200,
+        neurons=8,
     ),
     "MuJoCo, cart and pole": Case(
         mechanism(CART, ("pole.mass", "hinge.damping"), "slider.force", "hinge.torque"),
@@ -181,9 +183,10 @@ CASES = {
         {"push": (-2, 2, 15)},
         {"slider": 0, "hinge": 1},
         {"pole.mass": 0.5, "hinge.damping": 0.08},
-        ("slider_velocity", "hinge"),
+        ("slider_velocity", "hinge_velocity"),
         0.02,
         200,
+        neurons=8,
     ),
 }
 
@@ -434,7 +437,7 @@ def one_draw(case: Case, source: Any, seed: int, physics: Any = None) -> list[tu
     """
     record = drawn(case, seed)
     alone, half = physics_only(case, source, record)
-    learner = oa.MLP((3,), inputs=case.sees)
+    learner = oa.MLP((case.neurons,), inputs=case.sees)
     fit = oa.estimate(record, physics or source, learner=learner, seed=seed, blocks=0)
     return [
         (*judged(fit, i, true), 100 * (alone[i] / true - 1), abs(alone[i] - true) <= half[i])

@@ -271,7 +271,8 @@ class Inertia:
         _, mjx = _modules(self.mechanism.file)
         model, data = _changed(self.mechanism, self.parameters, p[: len(self.parameters)])
         data = data.replace(qpos=x[: self.mechanism.compiled.nq])
-        return mjx.full_m(model, mjx.fwd_position(model, data))
+        data = mjx.com_pos(model, mjx.kinematics(model, data))
+        return mjx.full_m(model, mjx.crb(model, data))
 
 
 def _changed(mechanism: Mechanism, parameters: Sequence[Place], p: Any) -> tuple[Any, Any]:
