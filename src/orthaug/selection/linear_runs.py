@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -74,7 +74,7 @@ class OutputRows:
     @cached_property
     def regressors(self) -> Matrix:
         """The lags of all experiments."""
-        return np.concatenate([lags.reshape(-1, lags.shape[-1]) for lags in self.lags])
+        return np.concatenate([_below_each_other(lags) for lags in self.lags])
 
     @cached_property
     def target(self) -> Vector:
@@ -107,16 +107,13 @@ class OutputRows:
 
         None where A is unstable.
         """
-        from scipy.signal import lfilter
-
         taps = self.denominator(theta)
         if not self.orders.na or np.any(np.abs(np.roots(taps)) >= 1):
             return None
-        columns = self.orders.size + 1
         lags = self.lags if runs is None else self._lags_of(runs)
-        followed = [lfilter([1.0], taps, one, axis=1).reshape(-1, columns) for one in lags]
         outputs = self.measured if runs is None else runs
-        return np.concatenate(followed), in_turn([lfilter([1.0], taps, y, axis=1) for y in outputs])
+        rows = np.concatenate([_below_each_other(_follow(taps, one)) for one in lags])
+        return rows, in_turn([_follow(taps, one) for one in outputs])
 
     def _lags_of(self, runs: Sequence[Matrix]) -> list[Stack]:
         """Return the lags with the outputs of runs in place of the measured ones."""
@@ -130,6 +127,18 @@ class OutputRows:
 def in_turn(runs: Sequence[Matrix]) -> Vector:
     """Return the rows of groups of experiments, one experiment after the other."""
     return np.concatenate([run.reshape(-1) for run in runs])
+
+
+def _below_each_other(lags: Stack) -> Matrix:
+    """Return the rows of a group of experiments, one experiment after the other."""
+    return lags.reshape(-1, lags.shape[-1])
+
+
+def _follow(taps: Vector, signals: Any) -> Any:
+    """Return signals of experiments (n, rows, …) filtered by 1/A, each from rest."""
+    from scipy.signal import lfilter
+
+    return lfilter([1.0], taps, signals, axis=1)
 
 
 def reduced_poles(record: Record, j: int) -> Poles:
@@ -175,14 +184,9 @@ def reduced_poles(record: Record, j: int) -> Poles:
 
 def from_poles(rows: OutputRows, taps: Vector) -> list[Vector]:
     """Return θ with these poles, whose free run from rest follows the output best; none without."""
-    from scipy.signal import lfilter
-
     na, cut = rows.orders.na, rows.fitted
     driven = np.concatenate(
-        [
-            lfilter([1.0], taps, lags[..., na:], axis=1).reshape(-1, lags.shape[-1] - na)
-            for lags in rows.lags
-        ]
+        [_below_each_other(_follow(taps, lags[..., na:])) for lags in rows.lags]
     )[:cut]
     scale = np.maximum(np.linalg.norm(driven, axis=0), 1e-300)
     if not np.isfinite(driven).all():
