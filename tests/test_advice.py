@@ -28,7 +28,7 @@ from orthaug.commands.advice import (
     _conclude_trials,
     _tried,
 )
-from orthaug.commands.motion import _has_term
+from orthaug.commands.motion import MotionPhysics, _has_term
 from orthaug.commands.proposals import (
     Proposal,
     _delay,
@@ -687,6 +687,53 @@ b = { initial = 1.5, min = 0 }
 g = { initial = 20, min = 0 }
 d = { initial = 2, min = 0 }
 """
+
+
+def test_trials_keep_the_integrator_of_the_fit():
+    """With its substeps alone they ran under Runge-Kutta, which a stiff motion leaves at once."""
+    scheme = SimpleNamespace(discrete=False)
+    motion = SimpleNamespace(scheme=scheme, integrator="exact")
+    fit: Any = SimpleNamespace(
+        model=SimpleNamespace(form=SimpleNamespace(motion=motion, substeps=3))
+    )
+    physics = MotionPhysics(motion=_NO_FIT)
+    assert physics.settled(fit) == {"motion.integrator": "exact", "motion.substeps": 3}
+
+
+def test_trials_begin_at_the_spec_where_none_can_begin_at_the_fit(monkeypatch):
+    """An inductance that the fit drove to 1e-7 makes modes too fast to begin at, and none was made."""
+    physics = SimpleNamespace(
+        settled=lambda fit: {"motion.substeps": 1},
+        with_initials=lambda job, fit: {"motion.parameters.L.initial": 1e-7},
+        most_trials=2,
+    )
+    job: Any = SimpleNamespace(physics=physics)
+    rows: Any = SimpleNamespace(held=None, skips=0, where="the rest", which="")
+    monkeypatch.setattr(ValidationRows, "of", lambda job: rows)
+    monkeypatch.setattr("orthaug.commands.advice.squared_errors", lambda *_: pieces_of(0.09))
+
+    def of(trials: Trials, proposal: Proposal) -> ProposalErrors:
+        assert trials.settled["motion.substeps"] == 1
+        begins = "motion.parameters.L.initial" not in trials.settled
+        size = 0.01 if proposal.change else 0.09
+        return ProposalErrors(proposal, pieces_of(size) if begins else None)
+
+    monkeypatch.setattr(Trials, "of", of)
+    fit: Any = SimpleNamespace(
+        model=SimpleNamespace(simulate=lambda held: None),
+        problem=SimpleNamespace(deviation=None),
+        criterion=None,
+        learns=False,
+    )
+    none: dict[str, Any] = {"warnings": [], "parameters": [], "residuals": None}
+    result: Any = SimpleNamespace(standard_errors_by="", **none)
+    hold = Proposal('hold = "spline"', {"motion.hold": "spline"})
+    found = _tried(job, fit, result, [], [hold])
+    assert found is not None and [one.change for one in found[0]] == [hold.change]
+
+
+def pieces_of(size: float) -> Any:
+    return [np.random.default_rng(0).exponential(size, 400)]
 
 
 def test_no_change_is_judged_by_free_runs_of_an_unstable_plant():

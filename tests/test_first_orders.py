@@ -11,6 +11,8 @@ from scipy.signal import butter, lfilter
 
 from orthaug import Record
 from orthaug.selection.first_orders import first_model, first_significant_lag
+from orthaug.selection.linear_runs import OutputRows, in_turn
+from orthaug.selection.orders import Orders
 
 
 def tank(seed: int, rows: int = 600) -> Record:
@@ -178,3 +180,30 @@ def test_a_dead_time_is_found_beside_the_rows_before_it(delay, kind):
     y = lfilter([0] * delay + [1.0], [1, -0.8], u)
     record = Record.from_arrays(u, y + 0.05 * y.std() * rng.normal(size=900))
     assert first_significant_lag(record, 0) == delay
+
+
+def test_pieces_of_one_length_run_side_by_side(monkeypatch):
+    """One by one 600 pieces of 10 rows took `init` of a year of hours over five minutes."""
+    import scipy.signal
+
+    calls = []
+
+    def counted(*args, **options):
+        calls.append(args)
+        return lfilter(*args, **options)
+
+    monkeypatch.setattr(scipy.signal, "lfilter", counted)
+    record = tank(0)
+    short = OutputRows([record.experiments[0].rows(k, k + 12) for k in range(0, 588, 10)], 0, LAGS)
+    runs = short.free_runs(THETA)
+    assert len(calls) == len(runs) == 1
+    single = [OutputRows([e], 0, LAGS).free_runs(THETA)[0] for e in short.experiments]
+    np.testing.assert_allclose(in_turn(runs), in_turn(single), rtol=1e-12)
+    filtered, alone = short.filtered(THETA, runs), OutputRows(short.experiments[3:4], 0, LAGS)
+    own = alone.filtered(THETA, [single[3]])
+    assert filtered is not None and own is not None
+    for all_rows, its in zip(filtered, own, strict=True):
+        np.testing.assert_allclose(all_rows[30:40], its, rtol=1e-12)
+
+
+LAGS, THETA = Orders(2, (1,), (1,)), np.array([1.2, -0.3, 0.1, 0.05])

@@ -117,6 +117,21 @@ def test_an_input_that_acts_at_once_is_not_moved(at_once):
     assert ("rows may be logged late" in found.text) == bool(at_once)
 
 
+def test_an_input_that_moves_between_samples_is_not_moved():
+    """It acts half a sample early beside its steps, which a whole sample half mends."""
+    rng, fine = np.random.default_rng(0), 10
+    u = np.zeros(400 * fine)
+    for k in range(len(u) - 1):
+        u[k + 1] = 0.97 * u[k] + 0.2 * rng.normal()
+    x = np.zeros(len(u))
+    for k in range(len(u) - 1):
+        x[k + 1] = 0.7 * x[k] + 0.3 * 2 * u[k]
+    y = x[::fine] + 0.01 * rng.normal(size=400)
+    record = oa.Record.from_arrays(u[::fine], y, sampling_time=STEP, inputs=["u"], outputs=["y"])
+    found = oa.estimate(record, LAG, learner=None).diagnose().residuals
+    assert found.verdict == "unmodelled" and found.late == []
+
+
 def test_a_discrete_plant_without_delay_is_not_moved():
     """Its equations have u act a sample later; that it acts at once is no fault of the logger."""
     found = oa.estimate(logged(-1), STEPS, learner=None).diagnose().residuals

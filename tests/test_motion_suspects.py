@@ -570,3 +570,20 @@ def test_terms_of_a_difference_in_an_equation_are_usual_suspects():
     temperature, rows = 20 + rng.normal(size=(1, 50)), rng.normal(size=(2, 50))
     usual = Catalogue.of_motion(motion, motion.initial, temperature.T, rows.T).usual()
     assert "quadratic_drag of T - outside" in {suspect.name for suspect in usual}
+
+
+def test_a_difference_that_two_equations_have_either_way_round_is_one_argument():
+    """Every term of w - q was listed twice, once with its sign turned."""
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("w", "(force - d*(w - q))/m", start="y"),
+            oa.State("q", "-d*(q - w)/m", start=0.0),
+        ],
+        [oa.Output("y", "w")],
+        [oa.PhysicalParameter(n, 1.0) for n in "dm"],
+        ["force"],
+    )
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
+    names = {suspect.name for suspect in Catalogue.of_motion(motion, motion.initial, x, u).usual()}
+    assert any("w - q" in name for name in names) and not any("q - w" in name for name in names)

@@ -355,17 +355,21 @@ def soften_jumps(
 def _differences(motion: Motion) -> list[str]:
     """Return the differences of states and inputs in the equations, as of two temperatures.
 
-    What drives heat, or stretches a spring, is likely what a missing term depends on.
+    What drives heat, or stretches a spring, is likely what a missing term depends on. Of a pair,
+    which the equations of two masses have either way round, the first one counts.
     """
     if motion.functions is not None:
         return []
     known = {*motion.names_of_states, *motion.inputs}
-    found = [
-        f"{node.left.id} - {node.right.id}"
+    pairs = [
+        (node.left.id, node.right.id)
         for expression in motion.equations.values()
         for node in ast.walk(expression.tree)
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
         if isinstance(node.left, ast.Name) and isinstance(node.right, ast.Name)
         if {node.left.id, node.right.id} <= known
     ]
-    return list(dict.fromkeys(found))
+    first: dict[frozenset[str], tuple[str, str]] = {}
+    for pair in pairs:
+        first.setdefault(frozenset(pair), pair)
+    return [f"{left} - {right}" for left, right in first.values()]

@@ -438,7 +438,8 @@ def _advance(fits: _LateFits) -> int:
     """Return the samples by which an input surely acts earlier than recorded; 0 of none.
 
     A plant on which the input acts at once resembles that, but then what an advance leaves still
-    follows the input; and a discrete plant may well have no delay.
+    follows the input; and a discrete plant may well have no delay. So does an input that goes on
+    between samples, on average half a sample early: then another hold explains as much.
     """
     if fits.task.problem.motion.scheme.discrete:
         return 0
@@ -446,7 +447,18 @@ def _advance(fits: _LateFits) -> int:
     while early < _EARLIEST and left(-early - 1) < left(-early):
         early += 1
     clearly = left(-early) < min((1 - _LATE) * left(0), _EXPLAINED)
-    return early if early and clearly and _followed(fits, -early) < _FOLLOWED else 0
+    if not early or not clearly or _followed(fits, -early) >= _FOLLOWED:
+        return 0
+    return 0 if _moves_between(fits.task, fits.solver, left(-early)) else early
+
+
+def _moves_between(task: MotionTask, solver: Any, left: float) -> bool:
+    """Return whether under another hold than a step no more than so much is left."""
+    motion, record = task.problem.motion, task.problem.record
+    if motion.hold != "zero-order" or is_stepped(record):
+        return False
+    others = (_try_hold(hold, task, solver).residual for hold in HOLDS if hold != motion.hold)
+    return any(other is not None and other <= left for other in others)
 
 
 def _followed(fits: _LateFits, samples: float) -> float:

@@ -188,6 +188,10 @@ class Trials:
             base = mended and mended[0]
         return ProposalErrors(proposal, made[0], base, initials)
 
+    def errors_of(self, proposal: Proposal, _: object) -> ProposalErrors:
+        """Return the trial of a proposal, for a runner of several."""
+        return self.of(proposal)
+
     def restarted(self, base: Pieces, tried: list[ProposalErrors]) -> list[ProposalErrors]:
         """Return the trials, less those that only led the unchanged spec to a better solution.
 
@@ -248,22 +252,23 @@ def _tried(
     learns = fit.learns
     variant = Variant(None if learns else PHYSICS_ONLY, criterion=fit.criterion)
     own = squared_errors(fit.model.simulate(rows.held), fit.problem.deviation, rows.skips)
-    here, settled = math.sqrt(mean_square(own)), job.physics.settled(fit)
+    here, starts = math.sqrt(mean_square(own)), [job.physics.settled(fit)]
     if here < _FOLLOWS:
-        settled |= job.physics.with_initials(job, fit)
-    trials = Trials(job, rows, variant, fit.problem.deviation, settled)
-
-    def errors_of(proposal: Proposal, _: object) -> ProposalErrors:
-        return trials.of(proposal)
+        starts.insert(0, starts[0] | job.physics.with_initials(job, fit))
 
     # Where samples are to be mended, what seems missing may come from these: it is tried after them
     narrow = [proposal for proposal in found if proposal.narrows]
     replacing = [proposal for proposal in found if proposal.replaces]
     others = [proposal for proposal in found if not (proposal.narrows or proposal.replaces)]
     chosen = [*narrow, *replacing, *others[: job.physics.most_trials]]
-    runs = iterate_results(errors_of, [Proposal("the spec as it is", {}), *(mending or chosen)])
-    base = next(runs).pieces
-    if base is None:
+    listed = [Proposal("the spec as it is", {}), *(mending or chosen)]
+    for settled in starts:  # values that a fit ended at may be none that a spec can begin at
+        trials = Trials(job, rows, variant, fit.problem.deviation, settled)
+        runs = iterate_results(trials.errors_of, listed)
+        base = next(runs).pieces
+        if base is not None:
+            break
+    else:
         return None
     before = math.sqrt(mean_square(base))
     far_off = before > _FAR_OFF * here
@@ -289,7 +294,7 @@ def _tried(
     if mending and any(_helps(one, base) for one in tried):
         chosen = []
     elif mending:
-        tried += run_all(errors_of, chosen)
+        tried += run_all(trials.errors_of, chosen)
     tried = trials.restarted(base, tried)
     slow = result.standard_errors_by == "autoregressive" or any(
         warning.code == "too_long_memory" for warning in result.warnings

@@ -573,9 +573,9 @@ def _account(
     if model.restarted is not None:
         shown = ", ".join(percent(error, 3) for error in model.free_run)
         lines.append(
-            f"longer runs drift away, so the orders come from runs of {model.restarted} rows, each "
-            f"from measured outputs on. The error of such runs is {shown} on the last "
-            f"{percent(1 - FITTED)} of the training rows"
+            "longer runs do not follow the data, so the orders come from runs of "
+            f"{model.restarted} rows, each from measured outputs on. The error of such "
+            f"runs is {shown} on the last {percent(1 - FITTED)} of the training rows"
         )
     if cut - missing > LOOKED_AT:
         lines.append(

@@ -237,9 +237,14 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         }
 
     def settled(self, fit: MotionEstimate) -> dict[str, Any]:
-        """Return the substeps of a fit, as a change of the spec: a search would cost most."""
+        """Return integrator and substeps of a fit, as a change of the spec: a search costs most.
+
+        With given substeps the integrator is no longer chosen, so it is given, too.
+        """
         form = fit.model.form
-        return {} if form.motion.scheme.discrete else {"motion.substeps": form.substeps}
+        if form.motion.scheme.discrete:
+            return {}
+        return {"motion.integrator": form.motion.integrator, "motion.substeps": form.substeps}
 
     def rows_needed(self, spec: Spec) -> tuple[int, int]:
         """Return the rows before the first one with a prediction, and the fewest of a stretch.

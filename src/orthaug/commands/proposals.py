@@ -23,6 +23,7 @@ from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
 from orthaug.data.wild import mendings
 from orthaug.fitting.kinds import CRITERIA
+from orthaug.physics.motion import HOLDS
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
@@ -197,16 +198,18 @@ def proposals(job: Job, result: FitResult, fit: Estimate) -> list[Proposal]:
     states = list(_missing_states(job, result))
     first, then = (states, late) if states and _state_explains_more(result) else (late, states)
     first = [*_without_headings(job), *first]
+    likely, holds = _holds(job, result)
     found = [
         *first,
         *(Proposal(words, change) for change, words in job.physics.with_delays(job)),
         *then,
+        *likely,
         *_missing_terms(job, result),
         *_in_place_of_learner(job, result, fit),
         *_suspected_terms(job, result, fit),
         *_predicted_changes(job, result, fit),
         *_learner_for_equation(job, result, fit),
-        *_holds(job, result),
+        *holds,
     ]
     # A learner takes longest
     return _unique_proposals(
@@ -520,16 +523,21 @@ def _reads(inputs: tuple[str, ...], variable: str) -> bool:
     return any("".join(text.split()) == variable for text in inputs)
 
 
-def _holds(job: Job, result: FitResult) -> Iterator[Proposal]:
-    """Yield the holds of the inputs that are not used yet, likely ones first."""
+def _holds(job: Job, result: FitResult) -> tuple[list[Proposal], list[Proposal]]:
+    """Return the hold that the inputs themselves follow best, if it is another, and all others.
+
+    None where an input is recorded in steps: another hold would only fit better by chance.
+    """
     if result.residuals is None or result.residuals.verdict != "unmodelled":
-        return
-    holds = job.physics.other_holds(job.spec)
-    if job.train.source is None:
+        return [], []
+    holds, likely = job.physics.other_holds(job.spec), 0
+    if holds and job.train.source is None:
         record = job.train.record
-        if is_stepped(record):  # another one would only fit better by chance
+        if is_stepped(record):
             holds = tuple(hold for hold in holds if hold == "zero-order")
         else:
-            holds = sort_holds(record, holds)
-    for hold in holds:
-        yield Proposal(f'hold = "{hold}"', {"motion.hold": hold})
+            ranked = sort_holds(record, HOLDS)
+            holds = tuple(hold for hold in ranked if hold in holds)
+            likely = int(ranked[0] in holds)
+    found = [Proposal(f'hold = "{hold}"', {"motion.hold": hold}) for hold in holds]
+    return found[:likely], found[likely:]

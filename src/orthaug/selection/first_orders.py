@@ -23,6 +23,7 @@ from orthaug.selection.linear_runs import (
     best_free_run,
     driven_rows_of,
     from_poles,
+    in_turn,
     lag_rows,
     reduced_poles,
 )
@@ -218,9 +219,8 @@ def _fit_together(
     """
     first = orders.first_row
     y = np.concatenate([e.outputs[first:] for e in experiments])[:cut]
-    phi = np.concatenate([lag_rows(e, range(e.outputs.shape[1]), orders) for e in experiments])[
-        :cut
-    ]
+    which = range(y.shape[1])
+    phi = np.concatenate([lag_rows(e.outputs, e.inputs, which, orders) for e in experiments])[:cut]
     kept = _columns_together(y.shape[1], orders, pairs)
     kept[-1] &= constant
     scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
@@ -246,7 +246,7 @@ def _fit_together(
         for e, run in zip(experiments, runs, strict=True):
             outputs = e.outputs.copy()
             outputs[first:] = run
-            modelled.append(lag_rows(replace(e, outputs=outputs), range(outputs.shape[1]), orders))
+            modelled.append(lag_rows(outputs, e.inputs, which, orders))
         z = np.concatenate(modelled)[:cut]
     return best
 
@@ -266,7 +266,7 @@ def _run_together(e: Experiment, orders: Orders, theta: Matrix) -> Matrix:
     """Return the free run of all outputs from their first measured rows on."""
     first, ny = orders.first_row, e.outputs.shape[1]
     past = orders.na * ny
-    driven = driven_rows_of(e, orders) @ theta[past:]
+    driven = driven_rows_of(e.inputs, orders) @ theta[past:]
     along = theta[:past].T.copy()
     state = e.outputs[first - orders.na : first][::-1].reshape(-1).copy()
     run = np.empty((len(driven), ny))
@@ -437,7 +437,7 @@ def _regression(record: Record, most: int) -> tuple[Matrix, Vector] | None:
     """
     orders = Orders(MOST_LAGS, (most + 1,) * len(record.inputs), (0,) * len(record.inputs))
     rows = OutputRows(record.experiments, 0, orders)
-    phi, y = np.concatenate(rows.lags), rows.target
+    phi, y = rows.regressors, rows.target
     phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     if len(y) < 2 * orders.size or np.linalg.cond(np.linalg.qr(phi, mode="r")) > 1 / RANK:
         return None
@@ -507,7 +507,7 @@ def _errors(
         return None
     for j in range(len(record.outputs)):
         own = OutputRows(usable, j, orders, cut)
-        phi, y = np.concatenate(own.lags), own.target
+        phi, y = own.regressors, own.target
         scale = np.maximum(np.linalg.norm(phi[:cut], axis=0), 1e-300)
         theta, _, rank, _ = np.linalg.lstsq(phi[:cut] / scale, y[:cut], rcond=RANK)
         if rank < columns:
@@ -550,14 +550,14 @@ def free_run_errors(train: Record, test: Record, model: FirstModel) -> tuple[flo
         return tuple(errors.tolist()) if np.isfinite(errors).all() else None
     for j in range(len(train.outputs)):
         own, other = OutputRows(fitted, j, orders), OutputRows(tested, j, orders)
-        phi, y = np.concatenate(own.lags), own.target
+        phi, y = own.regressors, own.target
         phi = phi if model.offset else phi[:, :-1]
         scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
         theta = np.linalg.lstsq(phi / scale, y, rcond=RANK)[0] / scale
         theta = theta if model.offset else np.append(theta, 0.0)
-        runs = other.free_runs(theta) if train.inputs else [lags @ theta for lags in other.lags]
+        run = in_turn(other.free_runs(theta)) if train.inputs else other.regressors @ theta
         with np.errstate(all="ignore"):
-            missed = np.concatenate(runs) - other.target
+            missed = run - other.target
             error = np.sqrt(np.mean(missed**2)) / other.target.std()
         if not np.isfinite(error):
             return None

@@ -10,11 +10,13 @@ and where light damping makes these useless, at the poles of a long model that i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from itertools import groupby
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug.data.record import Experiment, Record
@@ -33,6 +35,8 @@ _RESPONSE = 200  # rows of its impulse response
 _PER_COLUMN = 5  # rows that one of its coefficients needs
 _REFINED = 5  # times that a fit is refined, at most
 
+Stack: TypeAlias = Float[np.ndarray, "... _ _"]
+"""Rows and columns of an experiment, or of several with an axis in front."""
 Poles: TypeAlias = dict[int, Vector]
 """Denominators by their degree."""
 
@@ -48,63 +52,93 @@ class OutputRows:
     """Rows that models are fitted to, the first of all experiments together; None for all."""
 
     @cached_property
-    def lags(self) -> list[Matrix]:
-        """Own past, inputs from their delays on, and 1, of each experiment."""
-        return [lag_rows(e, [self.output], self.orders) for e in self.experiments]
+    def pieces(self) -> list[tuple[Stack, Stack]]:
+        """Outputs and inputs of neighbouring experiments of one length, which run side by side."""
+        alike = groupby(self.experiments, key=len)
+        groups = [list(group) for _, group in alike]
+        return [
+            (np.stack([e.outputs[:, [self.output]] for e in g]), np.stack([e.inputs for e in g]))
+            for g in groups
+        ]
 
     @cached_property
-    def measured(self) -> list[Vector]:
-        """The output of each experiment."""
-        return [e.outputs[self.orders.first_row :, self.output] for e in self.experiments]
+    def lags(self) -> list[Stack]:
+        """Own past, inputs from their delays on, and 1, of each group of experiments."""
+        return [lag_rows(*piece, [0], self.orders) for piece in self.pieces]
+
+    @cached_property
+    def measured(self) -> list[Matrix]:
+        """The output of each group of experiments."""
+        return [outputs[:, self.orders.first_row :, 0] for outputs, _ in self.pieces]
+
+    @cached_property
+    def regressors(self) -> Matrix:
+        """The lags of all experiments."""
+        return np.concatenate([_below_each_other(lags) for lags in self.lags])
 
     @cached_property
     def target(self) -> Vector:
         """The output of all experiments."""
-        return np.concatenate(self.measured)
+        return in_turn(self.measured)
 
     def denominator(self, theta: Vector) -> Vector:
         """Return the coefficients of A, 1 in front."""
         return np.concatenate([[1.0], -theta[: self.orders.na]])
 
-    def free_runs(self, theta: Vector) -> list[Vector]:
-        """Return the output of each experiment, simulated from its first measured rows on."""
-        from scipy.signal import lfilter, lfiltic
+    def free_runs(self, theta: Vector) -> list[Matrix]:
+        """Return the outputs of each group, simulated from the first measured rows on."""
+        from scipy.linalg import hankel
+        from scipy.signal import lfilter
 
         na, first, runs = self.orders.na, self.orders.first_row, []
         taps = self.denominator(theta)
-        for e, lags in zip(self.experiments, self.lags, strict=True):
-            driven = lags[:, na:] @ theta[na:]
-            past = e.outputs[first - 1 :: -1, self.output][:na] if first else np.empty(0)
+        for (outputs, _), lags in zip(self.pieces, self.lags, strict=True):
+            driven = lags[..., na:] @ theta[na:]
+            past = outputs[:, first - na : first, 0][:, ::-1]
+            begun = past @ hankel(-taps[1:]) if na else past
             with np.errstate(all="ignore"):
-                runs.append(lfilter([1.0], taps, driven, zi=lfiltic([1.0], taps, past))[0])
+                runs.append(lfilter([1.0], taps, driven, axis=1, zi=begun)[0])
         return runs
 
     def filtered(
-        self, theta: Vector, runs: Sequence[Vector] | None = None
+        self, theta: Vector, runs: Sequence[Matrix] | None = None
     ) -> tuple[Matrix, Vector] | None:
         """Return regressors and output filtered by 1/A, measured or of free runs.
 
         None where A is unstable.
         """
-        from scipy.signal import lfilter
-
         taps = self.denominator(theta)
         if not self.orders.na or np.any(np.abs(np.roots(taps)) >= 1):
             return None
-        rows = self if runs is None else self._with_outputs(runs)
-        return (
-            np.concatenate([lfilter([1.0], taps, lags, axis=0) for lags in rows.lags]),
-            np.concatenate([lfilter([1.0], taps, outputs) for outputs in rows.measured]),
-        )
+        lags = self.lags if runs is None else self._lags_of(runs)
+        outputs = self.measured if runs is None else runs
+        rows = np.concatenate([_below_each_other(_follow(taps, one)) for one in lags])
+        return rows, in_turn([_follow(taps, one) for one in outputs])
 
-    def _with_outputs(self, runs: Sequence[Vector]) -> OutputRows:
-        """Return the rows with the outputs of runs in place of the measured ones."""
-        experiments = []
-        for e, run in zip(self.experiments, runs, strict=True):
-            outputs = e.outputs.copy()
-            outputs[self.orders.first_row :, self.output] = run
-            experiments.append(replace(e, outputs=outputs))
-        return replace(self, experiments=experiments)
+    def _lags_of(self, runs: Sequence[Matrix]) -> list[Stack]:
+        """Return the lags with the outputs of runs in place of the measured ones."""
+        first, found = self.orders.first_row, []
+        for (outputs, inputs), run in zip(self.pieces, runs, strict=True):
+            outputs = np.concatenate([outputs[:, :first], run[..., None]], axis=1)
+            found.append(lag_rows(outputs, inputs, [0], self.orders))
+        return found
+
+
+def in_turn(runs: Sequence[Matrix]) -> Vector:
+    """Return the rows of groups of experiments, one experiment after the other."""
+    return np.concatenate([run.reshape(-1) for run in runs])
+
+
+def _below_each_other(lags: Stack) -> Matrix:
+    """Return the rows of a group of experiments, one experiment after the other."""
+    return lags.reshape(-1, lags.shape[-1])
+
+
+def _follow(taps: Vector, signals: Any) -> Any:
+    """Return signals of experiments (n, rows, …) filtered by 1/A, each from rest."""
+    from scipy.signal import lfilter
+
+    return lfilter([1.0], taps, signals, axis=1)
 
 
 def reduced_poles(record: Record, j: int) -> Poles:
@@ -123,7 +157,7 @@ def reduced_poles(record: Record, j: int) -> Poles:
     orders = Orders(long, (long,) * nu, (1,) * nu)
     usable = [e for e in record.experiments if len(e) > long + 1]
     own = OutputRows(usable, j, orders)
-    phi, y = np.concatenate(own.lags)[:rows], own.target[:rows]
+    phi, y = own.regressors[:rows], own.target[:rows]
     scale = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     theta = np.linalg.lstsq(phi / scale, y, rcond=RANK)[0] / scale
     response = np.zeros((_RESPONSE, nu))
@@ -150,12 +184,10 @@ def reduced_poles(record: Record, j: int) -> Poles:
 
 def from_poles(rows: OutputRows, taps: Vector) -> list[Vector]:
     """Return θ with these poles, whose free run from rest follows the output best; none without."""
-    from scipy.signal import lfilter
-
     na, cut = rows.orders.na, rows.fitted
-    driven = np.concatenate([lfilter([1.0], taps, lags[:, na:], axis=0) for lags in rows.lags])[
-        :cut
-    ]
+    driven = np.concatenate(
+        [_below_each_other(_follow(taps, lags[..., na:])) for lags in rows.lags]
+    )[:cut]
     scale = np.maximum(np.linalg.norm(driven, axis=0), 1e-300)
     if not np.isfinite(driven).all():
         return []
@@ -178,7 +210,7 @@ def best_free_run(rows: OutputRows, starts: Sequence[Vector]) -> Vector:
                 runs = rows.free_runs(theta)
                 if thorough:
                     runs = _from_best_starts(rows, runs, theta)
-                simulated = np.concatenate(runs)
+                simulated = in_turn(runs)
                 with np.errstate(all="ignore"):
                     square = float(np.mean((simulated[:cut] - y[:cut]) ** 2))
                 if not square < own:
@@ -196,7 +228,7 @@ def best_free_run(rows: OutputRows, starts: Sequence[Vector]) -> Vector:
     return best
 
 
-def _from_best_starts(rows: OutputRows, runs: list[Vector], theta: Vector) -> list[Vector]:
+def _from_best_starts(rows: OutputRows, runs: list[Matrix], theta: Vector) -> list[Matrix]:
     """Return runs from the past by which they follow the rows that are fitted best.
 
     What light damping makes of the noise in a measured start lasts for long.
@@ -206,18 +238,21 @@ def _from_best_starts(rows: OutputRows, runs: list[Vector], theta: Vector) -> li
     na, taps, moved = rows.orders.na, rows.denominator(theta), []
     left = len(rows.target) if rows.fitted is None else rows.fitted
     for run, measured in zip(runs, rows.measured, strict=True):
-        count, left = min(len(run), left), max(left - len(run), 0)
-        if count > 2 * na and np.isfinite(run).all():
-            still = np.zeros(len(run))
-            free = np.stack([lfilter([1.0], taps, still, zi=zi)[0] for zi in np.eye(na)], axis=1)
-            if np.isfinite(free).all():
-                missed = measured[:count] - run[:count]
-                run = run + free @ np.linalg.lstsq(free[:count], missed, rcond=None)[0]
+        length = run.shape[1]
+        still = np.zeros(length)
+        free = np.stack([lfilter([1.0], taps, still, zi=zi)[0] for zi in np.eye(na)], axis=1)
+        whole, rest = divmod(min(left, run.size), length)
+        left, run = left - whole * length - rest, run.copy()
+        for fitted, count in ((slice(whole), length), (slice(whole, whole + 1), rest)):
+            if count > 2 * na and np.isfinite(free).all():
+                missed = measured[fitted, :count] - run[fitted, :count]
+                missed[~np.isfinite(run[fitted]).all(axis=1)] = 0.0
+                run[fitted] += (free @ np.linalg.lstsq(free[:count], missed.T, rcond=None)[0]).T
         moved.append(run)
     return moved
 
 
-def _by_instruments(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vector | None:
+def _by_instruments(rows: OutputRows, runs: list[Matrix], theta: Vector) -> Vector | None:
     """Return θ with the outputs of free runs as instruments, rows filtered by 1/A.
 
     None where A is not stable or the instruments do not determine θ.
@@ -228,7 +263,7 @@ def _by_instruments(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vect
     return _solved(*(part[: rows.fitted] for part in (instruments[0], *measured)))
 
 
-def _by_descent(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vector | None:
+def _by_descent(rows: OutputRows, runs: list[Matrix], theta: Vector) -> Vector | None:
     """Return θ after a step of Gauss and Newton on the errors of the free runs.
 
     Their slopes are the rows of the run, filtered by 1/A. None as of `_by_instruments`.
@@ -237,7 +272,7 @@ def _by_descent(rows: OutputRows, runs: list[Vector], theta: Vector) -> Vector |
     if filtered is None:
         return None
     slopes = filtered[0][: rows.fitted]
-    left = (rows.target - np.concatenate(runs))[: rows.fitted]
+    left = (rows.target - in_turn(runs))[: rows.fitted]
     step = _solved(slopes, slopes, left)
     return None if step is None else theta + step
 
@@ -251,20 +286,25 @@ def _solved(instruments: Matrix, rows: Matrix, target: Vector) -> Vector | None:
     return np.linalg.solve(system, (instruments / scale).T @ target) / scale
 
 
-def lag_rows(e: Experiment, outputs: Sequence[int], orders: Orders) -> Matrix:
-    """Return the rows of some outputs' past, lag by lag, of inputs from their delays on, and 1."""
-    first, count = orders.first_row, len(e) - orders.first_row
-    columns = [
-        e.outputs[first - i : first - i + count, j]
+def lag_rows(outputs: Stack, inputs: Stack, which: Sequence[int], orders: Orders) -> Stack:
+    """Return the rows of some outputs' past, lag by lag, of inputs from their delays on, and 1.
+
+    Args:
+        which: the channels of these outputs.
+    """
+    first, count = orders.first_row, outputs.shape[-2] - orders.first_row
+    own = [
+        outputs[..., first - i : first - i + count, j]
         for i in range(1, orders.na + 1)
-        for j in outputs
+        for j in which
     ]
-    return np.column_stack([*columns, driven_rows_of(e, orders)])
+    driven = driven_rows_of(inputs, orders)
+    return np.concatenate([*(one[..., None] for one in own), driven], axis=-1)
 
 
-def driven_rows_of(e: Experiment, orders: Orders) -> Matrix:
-    """Return the rows of inputs from their delays on, and 1."""
-    first, count, columns = orders.first_row, len(e) - orders.first_row, []
+def driven_rows_of(inputs: Stack, orders: Orders) -> Stack:
+    """Return the rows of inputs from their delays on, and 1; axes as of `lag_rows`."""
+    first, count, columns = orders.first_row, inputs.shape[-2] - orders.first_row, []
     for i, (nb, nk) in enumerate(zip(orders.nb, orders.nk, strict=True)):
-        columns += [e.inputs[first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
-    return np.stack([*columns, np.ones(count)], axis=1)
+        columns += [inputs[..., first - lag : first - lag + count, i] for lag in range(nk, nk + nb)]
+    return np.stack([*columns, np.ones((*inputs.shape[:-2], count))], axis=-1)
