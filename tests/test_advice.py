@@ -803,6 +803,69 @@ def test_friction_that_acts_as_an_input_does_is_named_and_advised_beside_it(tmp_
     assert advice["after"] < 0.3 * advice["before"]
 
 
+QUARTER_CAR = """
+[data]
+sampling_time = 0.005
+inputs = ["road"]
+outputs = ["acc", "travel"]
+train = { files = ["run.csv"] }
+[motion.states]
+zs = { derivative = "vs" }
+vs = { derivative = "-(k*(zs - zu) + c*(vs - vu))/300" }
+zu = { derivative = "vu" }
+vu = { derivative = "(k*(zs - zu) - c*(vu - vs) - kt*(zu - road))/40" }
+[motion.outputs]
+acc = "-(k*(zs - zu) + c*(vs - vu))/300"
+travel = "zs - zu"
+[motion.parameters]
+k = { initial = 12000, min = 0 }
+kt = { initial = 140000, min = 0 }
+c = { initial = 1000, min = 0 }
+[learner]
+kind = "none"
+"""
+
+
+def test_what_a_damper_lacks_is_missing_wherever_its_force_is(tmp_path):
+    """A suspension whose damping grows with its speed, in two equations and an acceleration."""
+    rng = np.random.default_rng(3)
+    road, x, rows = np.repeat(rng.normal(scale=0.02, size=150), 10), np.zeros(4), []
+
+    def field(x: np.ndarray, height: float) -> np.ndarray:
+        zs, vs, zu, vu = x
+        speed = vs - vu
+        force = 15000 * (zs - zu) + 800 * speed + 900 * speed * abs(speed)
+        return np.array([vs, -force / 300, vu, (force - 160000 * (zu - height)) / 40])
+
+    for height in road:
+        rows.append([height, field(x, height)[1], x[0] - x[2]])
+        for _ in range(10):
+            mid = x + 2.5e-4 * field(x, height)
+            x = x + 5e-4 * field(mid, height)
+    data = np.array(rows)
+    data[:, 1:] += 0.01 * data[:, 1:].std(axis=0) * rng.normal(size=(len(data), 2))
+    spec = put(tmp_path, QUARTER_CAR, data, "road,acc,travel")
+    code, out, err = orthaug("fit", spec, "--out", tmp_path / "fit")
+    assert code == 0, err
+    assert "beside the term c*(vs - vu) acts something" in unfolded(out)
+    result = json.loads((tmp_path / "fit" / "result.json").read_text())
+    term = result["residuals"]["missing"]["terms"][0]
+    assert (term["beside"], term["variable"], term["shape"]) == (
+        "c*(vs - vu)",
+        "(vs - vu)",
+        "drag",
+    )
+    assert term["coefficient"] == pytest.approx(900, rel=0.3)
+    change = result["advice"][0]["change"]
+    added = "size*((vs - vu)*abs(vs - vu))"
+    assert change["motion.states.vs.derivative"].startswith(
+        f"-(k*(zs - zu) + (c*(vs - vu) + {added}))"
+    )
+    assert f"- (c*(vu - vs) - {added})" in change["motion.states.vu.derivative"]
+    assert added in str(change["motion.outputs.acc"])
+    assert result["advice"][0]["after"] < 0.3 * result["advice"][0]["before"]
+
+
 TURNTABLE = """
 [data]
 sampling_time = 0.02

@@ -156,7 +156,7 @@ class SuspectResult(Content):
 class MissingTermResult(Placed, Content):
     """A term that an equation of a motion may lack.
 
-    `equation` is None of one of an `output`, and of one that acts as the input `beside` does.
+    `equation` is None of one of an `output`, and of one that acts as the input or force `beside`.
     """
 
     absent = frozenset({"beside", "saturates"})

@@ -45,7 +45,7 @@ class Placed:
     def place(self: Any) -> str:
         """Place of the term: the equation of a state or of an output, or an input."""
         if self.beside is not None:
-            return f"the input {self.beside}"
+            return f"the {'input' if self.beside.isidentifier() else 'term'} {self.beside}"
         if self.equation is None:
             return f"the equation of the output {self.output}"
         return f"the equation of {self.equation}"
@@ -77,8 +77,9 @@ class MissingTerm(Placed):
     """A term that could be added: its equation, its variable, its shape, and what it would explain.
 
     `equation` is None of a term of an output, which `output` names then, and of one that acts as
-    the input `beside` does, in all equations that have it. `coefficient` is in the units of
-    equation and variable, `share` that of the errors' variance, less what chance explains.
+    the input or the shared force `beside` does, in all equations that have it. `coefficient` is in
+    the units of equation and variable, `share` that of the errors' variance, less what chance
+    explains.
     """
 
     equation: str | None

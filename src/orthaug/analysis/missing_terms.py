@@ -37,12 +37,13 @@ from orthaug.analysis.missing_term import (
 from orthaug.analysis.term_sensitivities import (
     Sensitivities,
     Terms,
-    input_slopes,
+    acting_slopes,
     sensitivities,
 )
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.fitting.whiteness import whitening_filter
 from orthaug.physics.motion import Motion
+from orthaug.physics.shared_forces import shared_forces
 
 # Shares of a variable's size, by quantiles: the widths that are tried, and those for the best one
 _WIDTHS, _FINER = (0.5, 0.8), tuple(np.linspace(0.1, 0.95, 18).tolist())
@@ -66,6 +67,7 @@ _UNLIKELY = 0.8
 _ELSEWHERE = 0.97  # of its gain: friction is where the movement is that it follows
 _TAKEN = (0.5, 2.0)  # of what an input does beyond a size: the same but for biased parameters
 _CERTAIN = 0.9  # of the error: what leaks from an input into a sensor explains all of it
+_SAME = 1e-5  # relative difference of what two forces do: they are one place
 _ENOUGH = 0.5  # of the error, from which on no other equations are looked at
 
 
@@ -124,9 +126,9 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
         states = [i for i in doubted if i < len(fit.problem.motion.states)]
         return None if len(states) == len(doubted) else _missing_in(fit, states)
     share = found.terms[0].share if found.terms else 0.0
-    inputs = _shared_inputs(fit) if share < _CERTAIN else ()
-    if inputs:  # what acts as one of these is in several equations at once
-        found = _better(found, _missing_in(fit, inputs))
+    shared = _shared_places(fit) if share < _CERTAIN else ()
+    if shared:  # what acts as one of these is in several equations at once
+        found = _better(found, _missing_in(fit, shared))
     if not others or (found.terms and found.terms[0].share > _ENOUGH):
         return found
     beyond = _missing_in(fit, others)  # a sensor may bend what it measures
@@ -143,25 +145,49 @@ def _better(found: MissingTest, other: MissingTest | None) -> MissingTest:
     return replace(other, p=min(2 * other.p, 1.0))
 
 
-def _shared_inputs(fit: MotionEstimate) -> tuple[int, ...]:
-    """Return the inputs that act in several equations, counted behind states and outputs.
+def _shared_places(fit: MotionEstimate) -> tuple[int, ...]:
+    """Return the inputs and forces that act in several equations, counted behind outputs.
 
-    Friction of a joint is a force there, and moves all that hangs on it, as its motor's does.
+    Friction of a joint is a force there, and moves all that hangs on it, as its motor's does. What
+    a damper between two masses lacks moves both.
     """
     motion = fit.problem.motion
     if motion.functions is not None or motion.source is not None:
         return ()
     first = len(motion.states) + len(motion.outputs)
     numbers = range(first, first + len(motion.inputs))
-    return tuple(i for i in numbers if (np.abs(_acting(fit, i)) > 0).any(axis=0).sum() > 1)
+    inputs = [i for i in numbers if (np.abs(_acting(fit, i)) > 0).any(axis=0).sum() > 1]
+    return (*inputs, *dict.fromkeys(_same_force(fit)))
+
+
+def _same_force(fit: MotionEstimate) -> list[int]:
+    """Return for each shared force the number of the first that acts as it does.
+
+    Spring and damper between two masses are one place.
+    """
+    motion, kept = fit.problem.motion, dict[int, Matrix]()
+    first, found = sum(map(len, (motion.states, motion.outputs, motion.inputs))), []
+    for i in range(first, first + len(shared_forces(motion))):
+        own = _acting(fit, i)
+        same = (
+            j
+            for j, other in kept.items()
+            if np.allclose(own, other, rtol=_SAME, atol=_SAME * np.abs(other).max(initial=0.0))
+        )
+        found.append(next(same, i))
+        kept.setdefault(found[-1], own)
+    return found
 
 
 def _acting(fit: MotionEstimate, number: int) -> Matrix:
-    """Return ∂f/∂u (m, nx) of an input, counted behind states and outputs, at some points."""
+    """Return ∂(f, h) (m, nx + ny) by what is added to an input or a shared force, at some points.
+
+    They are counted as by `acting_slopes`.
+    """
     motion, (x, u, p) = fit.problem.motion, _along(fit)
     rows = np.concatenate([x, u], axis=1)
     with np.errstate(all="ignore"):
-        return np.nan_to_num(input_slopes(motion, rows, p, number))
+        return np.nan_to_num(acting_slopes(motion, rows, p, number))
 
 
 def _along(fit: MotionEstimate) -> tuple[Matrix, Matrix, Vector]:
@@ -188,7 +214,9 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     """Return the test of terms in some equations, numbered as by `doubted_equations`."""
     motion = fit.problem.motion
     nx, ny = len(motion.states), len(motion.outputs)
-    names = (*motion.names_of_states, *(output.name for output in motion.outputs), *motion.inputs)
+    measured = (output.name for output in motion.outputs)
+    forces = map(str, shared_forces(motion))
+    names = (*motion.names_of_states, *measured, *motion.inputs, *forces)
     rows = int(fit.segmented.observations.sum())
     tried = Tried(*variables_of(motion), products_of(motion.visible), _WIDTHS)
     for fewer in ({"products": []}, {"beyond": ()}):
@@ -250,7 +278,8 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
             against = _acts_against(fit, moved[at], row, term.coefficient)
             term = replace(term, against=against)
         if equations[at] >= nx + ny:
-            term = replace(term, equation=None, beside=term.equation)
+            force = _force_along(fit, equations[at], term)
+            term = replace(term, equation=None, beside=force or term.equation)
         if not any(term.curves_like(other) for _, other in named):
             named.append((at, term))
     listed = [term for _, term in named]
@@ -264,12 +293,22 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     return MissingTest(p, freedom, share, tuple(listed))
 
 
+def _force_along(fit: MotionEstimate, number: int, term: MissingTerm) -> str | None:
+    """Return the force that acts as the one of a number, and has the term's own difference."""
+    motion = fit.problem.motion
+    if number < sum(map(len, (motion.states, motion.outputs, motion.inputs))):
+        return None
+    forces = zip(shared_forces(motion), _same_force(fit), strict=True)
+    alike = (f for f, first in forces if first == number)
+    return next((str(f) for f in alike if f"({f.first} - {f.second})" == term.variable), None)
+
+
 def _moved_by(fit: MotionEstimate, equation: int) -> Vector:
     """Return the directions (nx,), by sign, in which a term of an equation moves the states."""
     motion = fit.problem.motion
     nx, ny = len(motion.states), len(motion.outputs)
     if equation >= nx + ny:
-        return np.sign(np.median(_acting(fit, equation), axis=0))
+        return np.sign(np.median(_acting(fit, equation)[:, :nx], axis=0))
     return (np.arange(nx) == equation).astype(float)
 
 

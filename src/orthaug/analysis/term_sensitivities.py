@@ -16,10 +16,12 @@ from jaxtyping import Bool, Float
 
 from orthaug._base.checks import Matrix, Vector
 from orthaug._base.jax import AnyArray, Array, padded_length, quick_jit
+from orthaug.data.expressions import parse_named
 from orthaug.fitting.motion_estimate import MotionEstimate
 from orthaug.models.dynamics import Numbers
 from orthaug.models.moving import MotionDynamics
 from orthaug.physics.motion import Motion
+from orthaug.physics.shared_forces import shared_forces, with_input
 
 _ROWS = 20_000  # that are looked at, in segments spread over the record
 _STEP = 1e-4  # of an input's largest value, for its slopes
@@ -70,8 +72,7 @@ def sensitivities(
     """Return the sensitivities along the training segments; None where a value is not finite.
 
     Args:
-        equations: states whose equations the terms are added to; outputs, counted behind them; and
-            inputs behind these, as which the terms act then.
+        equations: what the terms are added to, counted as by `acting_slopes`.
         terms: makes the terms, given the points (n, M) of the runs.
         count: of terms.
     """
@@ -105,41 +106,53 @@ def sensitivities(
         )
         p = form.motion.coordinates.physical(np.asarray(numbers.c))
         acting = [
-            None if n0 <= i < n0 + target.shape[2] else _acting(form.motion, i, p, (rows, ends))
-            for i in equations
+            tuple(acting_slopes(form.motion, one, p, i) for one in (rows, ends)) for i in equations
         ]
         pace = 1.0 if segmented.record.even else form.split_pace(u)[1]
         halves = np.broadcast_to(form.sampling_time / 2 * pace, u.shape[:2])
-        columns = _propagate(to_next, to_output, added, at_ends, equations, acting, halves, form)
+        columns = _propagate(to_next, to_output, added, at_ends, acting, halves, form)
     kept = np.isfinite(columns).all(axis=(2, 3)) & np.isfinite(value).all(axis=2)
     if not kept[scored].all():
         return None
     return Sensitivities(columns, target - value, scored, points, n0, n0 + n)
 
 
-def _acting(motion: Motion, i: int, p: Vector, at: Sequence[Matrix]) -> tuple[Matrix, ...]:
-    """Return ∂ẋ (…, nx) by what is added to the equation of a state, or to an input, at rows."""
-    nx = len(motion.states)
-    if i >= nx:
-        return tuple(input_slopes(motion, one, p, i) for one in at)
-    found = (motion.mass.entries(one.reshape(-1, one.shape[-1])[:, :nx], p)[..., i] for one in at)
-    return tuple(part.reshape(*one.shape[:-1], nx) for part, one in zip(found, at, strict=True))
-
-
-def input_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matrix:
-    """Return ∂f/∂u (…, nx) by an input of the physics at states and inputs (…, nx + nu).
+def acting_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matrix:
+    """Return ∂(f, h) (…, nx + ny) by what is added somewhere, at states and inputs (…, nx + nu).
 
     Args:
-        number: of the input, counted behind states and outputs.
+        number: of the equation of a state, behind these of an output, then of an input, and last
+            of a force that equations share.
     """
-    nx, at = len(motion.states), number - len(motion.outputs)
-    flat = rows.reshape(-1, rows.shape[-1]).T
-    step = _STEP * max(float(np.abs(flat[at]).max(initial=0.0)), 1e-12)
-    moved = np.zeros((len(flat), 1))
+    nx, ny = len(motion.states), len(motion.outputs)
+    flat = rows.reshape(-1, rows.shape[-1])
+    if number < nx + ny:
+        found = np.zeros((len(flat), nx + ny))
+        if number < nx:
+            found[:, :nx] = motion.mass.entries(flat[:, :nx], p)[..., number]
+        else:
+            found[:, number] = 1.0
+        return found.reshape(*rows.shape[:-1], nx + ny)
+    at, size = number - ny, np.abs(flat[:, min(number - ny, flat.shape[1] - 1)])
+    if at >= flat.shape[1]:
+        force = shared_forces(motion)[at - flat.shape[1]]
+        known = parse_named(str(force), motion.known, str(force))
+        size = np.abs(known.value(motion.values(flat[:, :nx].T, flat[:, nx:].T, p, np), np))
+        motion, at = with_input(motion, force), flat.shape[1]
+        flat = np.append(flat, np.zeros((len(flat), 1)), axis=1)
+    step = _STEP * max(float(size.max(initial=0.0)), 1e-12)
+    moved = np.zeros(flat.shape[1])
     moved[at] = step
-    points = (flat + moved, flat - moved)
-    there, back = (np.asarray(motion.rates(one[:nx], one[nx:], p, np)) for one in points)
-    return ((there - back) / (2 * step)).T.reshape(*rows.shape[:-1], nx)
+    there, back = (
+        np.concatenate(
+            [
+                np.asarray(motion.rates(one[:nx], one[nx:], p, np)),
+                np.asarray(motion.observed(one[:nx], one[nx:], p, np)),
+            ]
+        )
+        for one in ((flat + moved).T, (flat - moved).T)
+    )
+    return ((there - back) / (2 * step)).T.reshape(*rows.shape[:-1], nx + ny)
 
 
 def _ends(rows: Matrix, n0: int, hold: str) -> Matrix:
@@ -179,8 +192,7 @@ def _propagate(
     to_output: np.ndarray,
     added: np.ndarray,
     at_ends: np.ndarray,
-    equations: Sequence[int],
-    acting: Sequence[tuple[Matrix, ...] | None],
+    acting: Sequence[tuple[Matrix, ...]],
     halves: Matrix,
     form: MotionDynamics,
 ) -> Any:
@@ -189,30 +201,26 @@ def _propagate(
     The terms act by the trapezoidal rule: `added` at the begin of a sample, `at_ends` at its end.
 
     Args:
-        acting: ∂ẋ (m, T, n0) by a term there; None where it acts on an output.
+        acting: ∂(ẋ, y) (m, T, n0 + ny) by a term there, at begin and end of every sample.
         halves: of the seconds (m, T) that each step takes.
     """
     m, steps, n0, own = to_next.shape
     q = len(added)
-    columns = np.zeros((m, steps, to_output.shape[2], own + q * len(equations)))
+    columns = np.zeros((m, steps, to_output.shape[2], own + q * len(acting)))
     slope = np.zeros((m, n0, columns.shape[3]))
     slope[:, :, :n0] = np.eye(n0)
     for k in range(steps):
         a, c = to_next[:, k, :, :n0], to_output[:, k, :, :n0]
         columns[:, k] = c @ slope
         columns[:, k, :, n0:own] += to_output[:, k, :, n0:]
-        for place, i in enumerate(equations):
-            if i >= n0 and acting[place] is None:
-                columns[:, k, i - n0, own + place * q : own + (place + 1) * q] = added[:, :, k].T
         slope = a @ slope
         slope[:, :, n0:own] += to_next[:, k, :, n0:]
         now, then = added[:, :, k].T, at_ends[:, :, k].T  # (m, q)
         half = halves[:, k, None, None]
         for place, by in enumerate(acting):
             to = slice(own + place * q, own + (place + 1) * q)
-            if by is None:  # an output
-                continue
-            begin, end = (one[:, k, :, None] for one in by)  # (m, n0, 1)
+            columns[:, k, :, to] += by[0][:, k, n0:, None] * now[:, None]
+            begin, end = (one[:, k, :n0, None] for one in by)  # (m, n0, 1)
             if form.motion.scheme.discrete:
                 slope[:, :, to] += begin * now[:, None]
                 continue

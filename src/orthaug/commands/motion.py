@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -32,6 +33,7 @@ from orthaug.physics.learner_states import LearnerStates
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.physics.parameters import time_unit
 from orthaug.physics.problem import MotionProblem, pose_motion
+from orthaug.physics.shared_forces import shared_forces
 from orthaug.reports.result import CheckResult
 
 if TYPE_CHECKING:
@@ -143,6 +145,10 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             return self._in_place_of_input(job, place, f"({place} + {added})"), (
                 f"beside the input {place}"
             )
+        for force in shared_forces(motion):
+            if place == str(force):
+                change = self._rewritten(job, partial(force.with_added, added=added))
+                return change, f"beside every {place}"
         if place not in motion.names_of_states:
             return None
         key = motion.equation_key
@@ -152,25 +158,26 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         return {f"motion.states.{place}.{key}": f"{own} + {added}"}, f"in the equation of {place}"
 
     def _in_place_of_input(self, job: Job, name: str, expression: str) -> dict[str, Any]:
-        """Return the change that gives an input another value in equations and definitions.
+        """Return the change that gives an input another value."""
+        word = re.compile(rf"\b{re.escape(name)}\b")
+        return self._rewritten(job, lambda text: word.sub(lambda _: expression, text))
 
-        An output that reads it, such as an acceleration, is no exception.
+    def _rewritten(self, job: Job, rewrite: Callable[[str], str]) -> dict[str, Any]:
+        """Return the change that rewrites equations and definitions.
+
+        An output that has what changes, such as an acceleration, is no exception.
         """
         key, declared = self.motion.equation_key, job.declaration["motion"]
-        word = re.compile(rf"\b{re.escape(name)}\b")
         states, defined = declared["states"], declared.get("define", {})
         outputs = {output: declared_output(job, output) for output in declared["outputs"]}
         texts = {f"motion.states.{state}.{key}": str(own[key]) for state, own in states.items()}
         texts |= {f"motion.define.{own}": str(text) for own, text in defined.items()}
         change: dict[str, Any] = {
-            path: word.sub(lambda _: expression, text)
-            for path, text in texts.items()
-            if word.search(text)
+            path: new for path, text in texts.items() if (new := rewrite(text)) != text
         }
         for output, own in outputs.items():
-            if word.search(own["expression"]):
-                text = word.sub(lambda _: expression, own["expression"])
-                change[f"motion.outputs.{output}"] = own | {"expression": text}
+            if (new := rewrite(own["expression"])) != own["expression"]:
+                change[f"motion.outputs.{output}"] = own | {"expression": new}
         return change
 
     def with_lag(

@@ -84,7 +84,11 @@ class MassMatrix:
         return values.at[places].set(operation(self.function(x, p), values[places]))
 
 
-NO_MASS = MassMatrix(lambda x, p: jnp.zeros((0, 0)), (), ())
+def _no_forces(x: Any, p: Any) -> Any:
+    return jnp.zeros((0, 0))
+
+
+NO_MASS = MassMatrix(_no_forces, (), ())
 """Of a motion whose learner and missing terms are rates."""
 
 
