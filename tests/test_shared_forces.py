@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.term_sensitivities import acting_slopes
 from orthaug.physics.shared_forces import SharedForce, shared_forces, with_input
 
@@ -70,3 +71,40 @@ def test_what_is_added_acts_in_every_equation() -> None:
 )
 def test_a_force_is_changed_where_it_is(text: str, expected: str) -> None:
     assert SharedForce("c", "v", "w").with_added(text, "h") == expected
+
+
+def test_a_damper_that_grows_with_its_speed_is_one_missing_term() -> None:
+    """Two masses of 1 and 2 kg on a spring and a damper; a fit knows the damper's linear part."""
+    rng = np.random.default_rng(0)
+    push, x, rows = np.repeat(rng.normal(scale=15.0, size=60), 10), np.zeros(4), []
+
+    def rates(x: np.ndarray, u: float) -> np.ndarray:
+        speed = x[1] - x[3]
+        force = 8 * (x[0] - x[2]) + 0.3 * speed + 0.5 * speed * abs(speed)
+        return np.array([x[1], u - force - x[0], x[3], (force - x[2]) / 2])
+
+    for u in push:
+        rows.append([x[0], x[2]])
+        for _ in range(10):
+            middle = x + 2.5e-3 * rates(x, u)
+            x = x + 5e-3 * rates(middle, u)
+    y = np.array(rows)
+    y += 0.001 * y.std(axis=0) * rng.normal(size=y.shape)
+    motion = oa.Motion.from_equations(
+        [
+            oa.State("x", "v", "x"),
+            oa.State("v", "u - k*(x - z) - c*(v - w) - x"),
+            oa.State("z", "w", "z"),
+            oa.State("w", "(k*(x - z) + c*(v - w) - z)/2"),
+        ],
+        [oa.Output("x", "x"), oa.Output("z", "z")],
+        [oa.PhysicalParameter("k", 6.0, min=0), oa.PhysicalParameter("c", 0.5, min=0)],
+        ["u"],
+    )
+    record = oa.Record.from_arrays(push, y, sampling_time=0.05, inputs=["u"], outputs=["x", "z"])
+    found = missing_terms(oa.estimate(record, motion, learner=None, blocks=0))
+    assert found is not None and found.p < 1e-6
+    best = found.terms[0]
+    assert (best.beside, best.variable, best.shape) == ("c*(v - w)", "(v - w)", "drag")
+    assert 0.25 < best.coefficient < 0.75  # one step, from a linear part that holds some of it
+    assert "beside the term c*(v - w) acts something odd in (v - w)" in str(best)
