@@ -133,8 +133,10 @@ def acting_slopes(motion: Motion, rows: Matrix, p: Vector, number: int) -> Matri
         else:
             found[:, number] = 1.0
         return found.reshape(*rows.shape[:-1], nx + ny)
-    at, size = number - ny, np.abs(flat[:, min(number - ny, flat.shape[1] - 1)])
-    if at >= flat.shape[1]:
+    at = number - ny
+    if at < flat.shape[1]:
+        size = np.abs(flat[:, at])
+    else:
         force = shared_forces(motion)[at - flat.shape[1]]
         known = parse_named(str(force), motion.known, str(force))
         size = np.abs(known.value(motion.values(flat[:, :nx].T, flat[:, nx:].T, p, np), np))

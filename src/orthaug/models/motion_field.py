@@ -150,8 +150,7 @@ class MotionField:
             (own, split, split, own), (x_in, x_in, x, x), (u_in, u_in, u, u), own
         )
         held = held_own - held_split + self._values(numbers, inside)
-        beyond = beyond_split - beyond_own
-        beyond = beyond + share * held
+        beyond = beyond_split - beyond_own + share * held
         return jnp.where(jnp.all(inside == z), self._values(numbers, inside), beyond)
 
     def _rows_at(self, p: Any, x: Any, u: Any, own: Array) -> Any:
