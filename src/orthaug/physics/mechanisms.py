@@ -18,9 +18,10 @@ import numpy as np
 from orthaug._base.errors import InputError
 from orthaug._base.jax import jax, jnp
 from orthaug.physics.mass_matrix import MassMatrix
+from orthaug.physics.scalar_program import ScalarProgram, scalar_program
 from orthaug.physics.sources import Description, FileSource, Functions, Quantity, Seen
 
-_OPERATIONS = 1000  # of a step, roughly: large programs are written once into a loop
+_MOST = 1000  # operations on scalars; beyond, programs of MJX's arrays compile sooner
 _SIGNIFICANT = 1e-12  # to which a written file gives the same numbers again
 
 
@@ -55,10 +56,6 @@ class MuJoCo(FileSource):
 
     ending: ClassVar[str] = ".xml"
     target: ClassVar[str] = "mjcf"
-
-    @property
-    def operations(self) -> int:
-        return _OPERATIONS
 
     @cached_property
     def mechanism(self) -> Mechanism:
@@ -239,6 +236,14 @@ class Rates:
     parameters: tuple[Place, ...]
     actuators: tuple[int, ...]
 
+    @property
+    def operations(self) -> int:
+        """Number of operations on scalars, `_MOST` at most."""
+        nx = 2 * self.mechanism.compiled.njnt
+        return min(
+            len(_scalars(self, (nx,), (len(self.actuators),), (len(self.parameters),))), _MOST
+        )
+
     def __call__(self, x: Any, u: Any, p: Any) -> Any:
         x, u, p = (jnp.asarray(part, dtype=float) for part in (x, u, p))
         if x.ndim == 1:
@@ -248,6 +253,10 @@ class Rates:
 
     def at(self, x: Any, u: Any, p: Any) -> Any:
         """Return ẋ (nx,) at one point of JAX arrays."""
+        return _evaluate(self, x, u, p)
+
+    def by_mjx(self, x: Any, u: Any, p: Any) -> Any:
+        """Return ẋ (nx,) at one point by the algorithms of MJX."""
         _, mjx = _modules(self.mechanism.file)
         model, data = _changed(self.mechanism, self.parameters, p)
         half = len(x) // 2
@@ -268,6 +277,10 @@ class Inertia:
     parameters: tuple[Place, ...]
 
     def __call__(self, x: Any, p: Any) -> Any:
+        return _evaluate(self, x, p)
+
+    def by_mjx(self, x: Any, p: Any) -> Any:
+        """Return M (nq, nq) at one point by the algorithms of MJX."""
         _, mjx = _modules(self.mechanism.file)
         model, data = _changed(self.mechanism, self.parameters, p[: len(self.parameters)])
         data = data.replace(qpos=x[: self.mechanism.compiled.nq])
@@ -283,6 +296,18 @@ def _changed(mechanism: Mechanism, parameters: Sequence[Place], p: Any) -> tuple
         array = changes.get(place.array, getattr(model, place.array))
         changes[place.array] = array.at[place.index].set(value)
     return model.replace(**changes), data
+
+
+@lru_cache(maxsize=32)
+def _scalars(function: Rates | Inertia, *shapes: tuple[int, ...]) -> ScalarProgram:
+    """Return the algorithms of MJX with the constants of the mechanism folded away."""
+    return scalar_program(function.by_mjx, *shapes)
+
+
+def _evaluate(function: Rates | Inertia, *arguments: Any) -> Any:
+    """Return the result of MJX, by operations on scalars where these are few."""
+    program = _scalars(function, *(each.shape for each in arguments))
+    return program(*arguments) if len(program) <= _MOST else function.by_mjx(*arguments)
 
 
 @cache

@@ -542,9 +542,9 @@ class Motion(NotebookView):
 
     @cached_property
     def size(self) -> int:
-        """Return how many operations its expressions have; of functions what the source says."""
+        """Return how many operations its expressions have; of a function what it says of itself."""
         if self.functions is not None:
-            return 0 if self.source is None else self.source.operations
+            return getattr(self.functions[0], "operations", 0)
         every = (
             *self.equations.values(),
             *self.observations,

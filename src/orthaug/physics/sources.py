@@ -74,11 +74,6 @@ class PhysicsSource:
         return ()
 
     @property
-    def operations(self) -> int:
-        """Rough number of operations of its functions, where they are JAX's; 0 for few."""
-        return 0
-
-    @property
     def compiled(self) -> bool:
         """True if its functions are JAX's; others are calls of the host at every point."""
         return True

@@ -18,11 +18,6 @@ class Origin(Protocol):
     """Origin of a motion's functions; `physics.sources` has them."""
 
     @property
-    def operations(self) -> int:
-        """Rough number of operations of the functions, where they are JAX's; 0 for few."""
-        ...
-
-    @property
     def compiled(self) -> bool:
         """True if the functions are JAX's; others are calls of the host at every point."""
         ...
