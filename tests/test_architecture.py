@@ -66,7 +66,6 @@ CONCEPTS = {
     "physics.fmu_points": "values of an FMU, with slopes",
     "physics.mechanisms": "a kind of source",
     "physics.array_moves": "what only moves elements of arrays",
-    "physics.scalar_program": "arrays of JAX taken apart into scalars",
     "analysis.free_run_stability": "all checks of stability together",
     "analysis.observer": "the verb `observe`",
     "analysis.term_sensitivities": "slopes of a free run by terms that are added to it",

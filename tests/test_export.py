@@ -164,6 +164,34 @@ DISCRETE = oa.Motion.from_equations(
     parameters=[oa.PhysicalParameter("θ", 1.2), oa.PhysicalParameter("g", 0.7, "m/s²", min=0)],
     integrator="discrete",
 )
+
+
+def two_masses_rates(x, u, p):
+    """A cart with a pole, by a solution of its equations of forces; d slows down large speeds."""
+    forces = jnp.array([u[0] - p[1] * x[2] * jnp.abs(x[2]), -p[0] * jnp.sin(x[1])])
+    drag = jnp.where(p[1] > 0.1, 0.2, 5.0) * x[2:]
+    return jnp.concatenate([x[2:], jnp.linalg.solve(two_masses_inertia(x, p), forces - drag)])
+
+
+def two_masses_inertia(x, p):
+    side = 0.4 * jnp.cos(x[1])
+    return jnp.array([[1 + p[0], side], [side, 0.5]])
+
+
+def two_masses(forces: bool) -> oa.Motion:
+    states = [oa.State(s) for s in ("s", "a", "v")] + [oa.State("w", learned=True)]
+    names = (("force", "N"), ("torque", "N m"))
+    return oa.Motion.from_functions(
+        two_masses_rates,
+        lambda x, u, p: x[:2] + p[1] * u,
+        states,
+        ["y", oa.Output("angle", learned=True)],
+        [oa.PhysicalParameter("m", 0.8, min=0), oa.PhysicalParameter("d", 0.3)],
+        ["u"],
+        **({"mass": oa.MassMatrix(two_masses_inertia, (2, 3), names)} if forces else {}),
+    )
+
+
 LINEAR = [oa.Term("a", "y[k-1]"), oa.Term("b", "u[k-1]", unit="m/N"), oa.Term("c", "u[k-2]")]
 MODELS: dict[str, Callable[[], Model]] = {
     "several outputs, every activation": lambda: lagged(
@@ -209,6 +237,11 @@ MODELS: dict[str, Callable[[], Model]] = {
         moving(spring(integrator="exact"), ("v", "w"), oa.MLP((5,), beyond="hold"), substeps=1)
     ),
     "motion, one scaled input": lambda: moving(spring(), ("v/3",), oa.MLP((5,)), substeps=1),
+    "motion, functions": lambda: moving(two_masses(forces=False), ("v", "w"), oa.MLP((5,))),
+    "motion, functions and forces": lambda: moving(two_masses(forces=True), ("w",), oa.MLP((5,))),
+    "motion, functions and forces that fade": lambda: limited(
+        moving(two_masses(forces=True), ("v", "u"), oa.MLP((5,)))
+    ),
     "motion, discrete, no inputs": lambda: moving(DISCRETE, substeps=1),
 }
 
@@ -825,10 +858,20 @@ def refusals():
         moving(spring(hold="spline"), ("v", "w"), oa.MLP((2,))),
         "a step cannot interpolate by a spline over the whole record",
     )
-    made = oa.Motion.from_functions(
-        lambda x, u, p: x, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]
-    )
-    yield moving(made), "the motion is a Python function"
+    for f, words in (
+        (
+            lambda x, u, p: jax.lax.fori_loop(0, 3, lambda i, x: jnp.sin(x), x),
+            "the motion is a function with 'scan'",
+        ),
+        (
+            lambda x, u, p: jnp.where(x > 0, x, p),
+            "the motion is a function with 'gt' of a state or an input",
+        ),
+    ):
+        made = oa.Motion.from_functions(
+            f, lambda x, u, p: x, ["x"], ["y"], [oa.PhysicalParameter("a", 1.0)]
+        )
+        yield moving(made), words
 
 
 def test_models_without_code_are_refused_in_words(tmp_path):

@@ -141,6 +141,9 @@ def test_a_cart_pole_is_fitted_saved_and_written_back(tmp_path: Path) -> None:
     again = oa.load(tmp_path / "model")
     np.testing.assert_array_equal(again.simulate(data).model, fit.model.simulate(data).model)
     oa.export(fit.model, tmp_path / "written", "mjcf")
+    step, x, u = oa.numpy_step(fit.model), np.array([0.1, 0.4, -0.3, 0.8]), np.array([0.7])
+    for found, given in zip(step(x, u), fit.model.step(x, u), strict=True):
+        np.testing.assert_allclose(found, given, rtol=1e-12)
     written = MuJoCo(file=str(tmp_path / "written" / "model.xml"), parameters=("pole.mass",))
     assert written.build(["push"], ["slider"]).initial == pytest.approx(fit.values[:1], rel=1e-5)
 

@@ -46,6 +46,8 @@ FUNCTIONS = {
     "solving from the right": lambda x: jax.lax.linalg.triangular_solve(
         jnp.linalg.cholesky(A + jnp.diag(x)), jnp.outer(x, x), lower=True, transpose_a=True
     ),
+    "a linear system": lambda x: jnp.linalg.solve(A * (1 + x), jnp.sin(x)),
+    "two linear systems": lambda x: jnp.linalg.solve(A, jnp.outer(x, x)),
     "a known branch": lambda x: jax.lax.cond(jnp.array(True), jnp.sin, jnp.cos, x),
     "a branch by the input": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
     "a loop": loop,
@@ -87,6 +89,17 @@ def test_what_is_constant_or_zero_or_made_twice_is_gone():
     assert len(program) == 0
     twice = scalar_program(lambda x: jnp.sin(x[0]) * jnp.sin(x[0]) + 1 * jnp.sin(x[0]), (3,))
     assert [each.name for each in twice.operations] == ["input", "sin", "mul", "add"]
+
+
+def test_without_slopes_more_is_taken_apart():
+    def function(x):
+        return own_slope(x) + jax.lax.stop_gradient(x) + jnp.linalg.solve(A, x)
+
+    program = scalar_program(function, (3,), slopes=False)
+    x = jnp.array([0.2, -1.0, 0.7])
+    np.testing.assert_allclose(program(x), function(x), rtol=1e-13)
+    assert "call" not in {each.name for each in program.operations}
+    assert "call" in {each.name for each in scalar_program(function, (3,)).operations}
 
 
 CART = """<mujoco><option><flag contact="disable"/></option><worldbody>

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from orthaug._base.lines import with_unit
 from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
+from orthaug.export.motion_nodes import NodesOfMotion, PhysicsNodes
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.beyond import FADED
@@ -25,7 +25,6 @@ from orthaug.models.model import HoldsModel, Model, model_of
 from orthaug.models.motion_field import MotionField
 from orthaug.models.moving import MotionDynamics
 from orthaug.models.stepping import Memory
-from orthaug.physics.sources import FileSource
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +239,12 @@ def _weighted_terms(
 
 def _motion_names(model: Model[MotionDynamics], constants: _Constants) -> dict[str, Node]:
     """Return the meaning of the names of constants, parameters, states and inputs."""
-    form, numbers, motion = model.form, model.numbers, model.form.motion
-    values = np.asarray(
-        motion.coordinates.physical(np.asarray(numbers.theta) - np.asarray(numbers.theta_aux))
-    )
+    form, motion = model.form, model.form.motion
+    values, _ = _values_of_parameters(model)
     names: dict[str, Node] = {
         key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
-    for parameter, value in zip(motion.parameters, values.tolist(), strict=True):
+    for parameter, value in zip(motion.parameters, values.values(), strict=True):
         unit = f" [{parameter.unit}]" if parameter.unit else ""
         beside = ", beside the learner" if form.learns else ""
         names[parameter.name] = constants.node(
@@ -258,86 +255,80 @@ def _motion_names(model: Model[MotionDynamics], constants: _Constants) -> dict[s
     return names
 
 
-def _with_correction(
-    correction: Node, physics: Node, held: FadeNodes | None, rows: Sequence[Node]
-) -> Node:
-    """Return a learned equation with what is added to it.
+def _faded(correction: Node, held: FadeNodes | None, rows: Sequence[Node]) -> Node:
+    """Return a correction as it goes on beyond the range of training.
 
-    `rows` are its physics at p̂, and where it is held at c and at p̂.
+    `rows` are the physics of its equation at p̂, and at the border of the range at c and at p̂.
     """
     if rows:
-        physics, own, split = rows
+        _, own, split = rows
         correction = apply("add", correction, apply("sub", own, split))
-    return apply("add", physics, correction if held is None else held.fade(correction))
+    return correction if held is None else held.fade(correction)
 
 
-def _split_parameters(model: Model[MotionDynamics], constants: _Constants) -> dict[str, Node]:
+def _with_forces(
+    rates: Sequence[Node], forces: Sequence[Node], responses: Sequence[Sequence[Node]]
+) -> list[Node]:
+    """Return rates that grow by what forces do through the mass matrix."""
+    return [
+        total([rate, *(apply("mul", row[k], g) for row, g in zip(responses, forces, strict=True))])
+        for k, rate in enumerate(rates)
+    ]
+
+
+def _values_of_parameters(
+    model: Model[MotionDynamics],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the parameters beside the learner, and as estimated."""
+    numbers, motion = model.numbers, model.form.motion
+    theta = np.asarray(numbers.theta)
+    names = [parameter.name for parameter in motion.parameters]
+    beside, whole = (
+        dict(zip(names, np.asarray(motion.coordinates.physical(q)).tolist(), strict=True))
+        for q in (theta - np.asarray(numbers.theta_aux), theta)
+    )
+    return beside, whole
+
+
+def _split_parameters(values: Mapping[str, float], constants: _Constants) -> dict[str, Node]:
     """Return the estimated parameters, with which the physics continues beyond the data."""
-    motion = model.form.motion
-    values = np.asarray(motion.coordinates.physical(np.asarray(model.numbers.theta))).tolist()
     return {
-        parameter.name: constants.node(
-            "p", f"{parameter.name}_split", value, f"{parameter.name}, as estimated"
-        )
-        for parameter, value in zip(motion.parameters, values, strict=True)
+        name: constants.node("p", f"{name}_split", value, f"{name}, as estimated")
+        for name, value in values.items()
     }
 
 
 def _motion(model: Model[MotionDynamics], name: str, digest: str) -> Program:
     form, numbers, motion = model.form, model.numbers, model.form.motion
-    if isinstance(motion.source, FileSource):
-        own = motion.source
-        raise InputError(
-            f"the motion is read from {Path(own.file).name}, which has no code here; `--to "
-            f"{own.target}` writes its parameters."
-        )
-    if motion.functions is not None:
-        raise InputError(f"the motion {_OWN_FUNCTION}.")
     constants = _Constants()
     names = _motion_names(model, constants)
-    numeric = dict(motion.constants)
-    defined: dict[str, Node] = {}
-
-    def define(names: dict[str, Node], suffix: str = "") -> dict[str, Node]:
-        """Return the names with those of the definitions, in terms of the others."""
-        for key, expression in motion.definitions:
-            local = f"v_{identifier(key)}{suffix}"
-            defined[local] = node_of(expression, names, {}, numeric)
-            names = names | {key: Name(local)}
-            constants.symbols[local] = key
-        return names
-
-    names = define(names)
-
-    def lower_expression(expression: Expression, names: Mapping[str, Node] = names) -> Node:
-        return node_of(expression, names, {}, numeric)
-
-    features = [lower_expression(entry) for entry in form.features]
-    learned_states, learned_outputs = form.corrected
-    equations = {"rate": [*motion.equations.values()], "output": [*motion.observations]}
-    results = {
-        kind: list(map(lower_expression, expressions)) for kind, expressions in equations.items()
-    }
-    held, changed = None, list[dict[str, Node]]()
+    beside, whole = _values_of_parameters(model)
+    physics = NodesOfMotion(form, dict(motion.constants), names, beside, constants.symbols)
+    base = physics.at(names, beside)
+    seen_names = physics.defined(names)
+    features = [node_of(entry, seen_names, {}, physics.numeric) for entry in form.features]
+    held, changed = None, list[PhysicsNodes]()
     if numbers.limits is not None:
         points: list[Node] = [
             *(Entry("x", i) for i in range(form.states)),
             *(names[key] for key in motion.inputs),
         ]
         held = FadeNodes.of(form, numbers, features, points)
-        defined |= dict(held.locals)
+        physics.locals |= dict(held.locals)
         constants.symbols |= held.symbols
         if np.any(
             numbers.theta_aux
         ):  # the physics itself extrapolates with the parameters that were split off
-            split = _split_parameters(model, constants)
+            apart = _split_parameters(whole, constants)
             inside = dict(zip((*motion.names_of_states, *motion.inputs), held.inside, strict=True))
-            bare = {key: node for key, node in names.items() if key not in dict(motion.definitions)}
             changed = [
-                define(bare | split, "_s"),
-                define(bare | inside, "_h"),
-                define(bare | inside | split, "_hs"),
+                physics.at(names | apart, whole, "_s"),
+                physics.at(names | inside, beside, "_h"),
+                physics.at(names | inside | apart, whole, "_hs"),
             ]
+    learned_states, learned_outputs = form.corrected
+    results = {"rate": list(base.rates), "output": list(base.outputs)}
+    forces: list[Node] = []
     blocks = {}
     for kind, learned, first in (
         ("output", learned_outputs, len(learned_states)),
@@ -348,14 +339,20 @@ def _motion(model: Model[MotionDynamics], name: str, digest: str) -> Program:
             seen = features if held is None else held.features
             network = _network(form.bound, numbers, seen, first + np.arange(len(learned)))
             for i, place in enumerate(learned):
-                rows = [lower_expression(equations[kind][place], there) for there in changed]
-                results[kind][place] = _with_correction(
-                    Entry("g", i), results[kind][place], held, rows
-                )
+                rows = [there.learned[first + i] for there in changed]
+                added = _faded(Entry("g", i), held, rows)
+                physics_row = base.learned[first + i]
+                if kind == "rate" and base.responses:
+                    moved = [apply("sub", rows[0], physics_row)] if rows else []
+                    forces.append(total([*moved, added]))
+                else:
+                    results[kind][place] = apply("add", rows[0] if rows else physics_row, added)
+        if kind == "rate" and forces:
+            results[kind] = _with_forces(base.rates, forces, base.responses)
         seen = list(network.features) if network is not None else []
         blocks[kind] = Block(
             kind,
-            _needed_definitions(defined, [*results[kind], *seen]),
+            _needed_definitions(physics.locals, [*results[kind], *seen]),
             network,
             tuple(results[kind]),
         )

@@ -18,6 +18,7 @@ import numpy as np
 from orthaug._base.jax import jax, jnp
 from orthaug.physics.array_moves import MOVES, filling, fills, scattered
 
+_LARGEST_RULE = 3  # rows of a system that is solved by determinants, which need no pivots
 _LARGEST_INVERSE = 8  # rows of a matrix whose factorization is written out
 
 # By the names of `jax.lax`, their counterparts in NumPy
@@ -56,6 +57,7 @@ _ELEMENTWISE = {
 }
 _OF_LAX = {"and": "bitwise_and", "not": "bitwise_not", "or": "bitwise_or"}
 _CONDITIONS = ("and", "eq", "ge", "gt", "le", "lt", "ne", "not", "or")
+_WITH_RULES = ("custom_jvp_call", "custom_vjp_call")
 _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat")
 
 
@@ -80,6 +82,13 @@ class Operation:
         if self.name == "call":
             return self.reads[1:]
         return self.reads[:1] if self.name == "part" else self.reads
+
+    def value(self, read: Sequence[Any]) -> Any:
+        """Return the result for numbers in place of `sources`, by NumPy."""
+        if self.name == "select":
+            return read[1] if read[0] else read[2]
+        with np.errstate(all="ignore"):
+            return getattr(np, _ELEMENTWISE[self.name])(*read).item()
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,16 +159,20 @@ class ScalarProgram:
         return _bound(call.equation, given)
 
 
-def scalar_program(function: Callable[..., Any], *shapes: tuple[int, ...]) -> ScalarProgram:
+def scalar_program(
+    function: Callable[..., Any], *shapes: tuple[int, ...], slopes: bool = True
+) -> ScalarProgram:
     """Return `function` of arrays of these shapes as a program of scalars.
 
     Args:
         function: Of JAX arrays in double precision, to one array or several.
         shapes: Shape of each argument.
+        slopes: Whether the program must have the function's derivatives, its own rules included;
+            without them more can be taken apart.
     """
     inputs = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
     traced, form = jax.make_jaxpr(function, return_shape=True)(*inputs)
-    making = _Making()
+    making = _Making(slopes)
     taken, arguments = 0, []
     for shape in shapes:
         count = math.prod(shape)
@@ -182,7 +195,8 @@ class _Scalars:
 class _Making:
     """Operations found so far; the same operation on the same results is kept once."""
 
-    def __init__(self) -> None:
+    def __init__(self, slopes: bool) -> None:
+        self.slopes = slopes
         self.operations: list[Operation] = []
         self.calls: list[Call] = []
         self._known: dict[Operation, int] = {}
@@ -239,8 +253,10 @@ class _Making:
     def _step(self, equation: Any, arguments: list[Any]) -> Sequence[Any]:
         name, parameters = equation.primitive.name, equation.params
         unknown = [isinstance(each, _Scalars) for each in arguments]
-        if name in _CALLS:
-            inner = parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
+        if name == "stop_gradient" and not self.slopes:
+            return arguments
+        if name in _CALLS or (name in _WITH_RULES and not self.slopes):
+            inner = parameters.get("jaxpr") or parameters["call_jaxpr"]
             return self.run(inner.jaxpr, inner.consts, arguments)
         if name == "cond" and not unknown[0]:
             inner = parameters["branches"][int(arguments[0])]
@@ -257,6 +273,9 @@ class _Making:
             return [_Scalars(each) for each in _several(MOVES[name].move(parameters, *lifted))]
         if not any(unknown):
             return _known_step(equation, arguments)
+        if name == "custom_linear_solve":
+            solution = self._linear_solution(parameters, arguments)
+            return self._called(equation, arguments) if solution is None else [_Scalars(solution)]
         read = [
             each for each, is_unknown in zip(equation.invars, unknown, strict=True) if is_unknown
         ]
@@ -304,6 +323,32 @@ class _Making:
             found[place] = self.apply("add", int(found[place]), int(updates[at]))
         return found
 
+    def _linear_solution(self, parameters: Any, arguments: list[Any]) -> np.ndarray | None:
+        """Return x of A x = b by Cramer's rule; None of a large A, or of several b."""
+        lengths, product = parameters["const_lengths"], parameters["jaxprs"].matvec
+        *held, right = arguments
+        b = self.lifted(right)
+        if len(held) != sum(lengths) or b.ndim != 1 or len(b) > _LARGEST_RULE:
+            return None
+        units = [[*held[: lengths.matvec], unit] for unit in np.eye(len(b))]
+        columns = [self.lifted(self.run(product.jaxpr, product.consts, e)[0]) for e in units]
+        whole = self._determinant(np.array(columns))
+        parts = [
+            self._determinant(np.array([*columns[:i], b, *columns[i + 1 :]])) for i in range(len(b))
+        ]
+        return np.array([self.apply("div", part, whole) for part in parts], np.int64)
+
+    def _determinant(self, rows: np.ndarray) -> int:
+        """Return the determinant, along the first row."""
+        if not len(rows):
+            return self.constant(np.array(1.0))
+        found = self.constant(np.array(0.0))
+        for i, entry in enumerate(rows[0]):
+            rest = self._determinant(np.delete(rows[1:], i, axis=1))
+            sign = "sub" if i % 2 else "add"
+            found = self.apply(sign, found, self.apply("mul", int(entry), rest))
+        return found
+
     def value(self, number: int) -> float | bool | None:
         """Return the value of an operation, None where it is not known."""
         each = self.operations[number]
@@ -313,8 +358,7 @@ class _Making:
         """Return the number of an operation on scalars, simplified."""
         values = [self.value(i) for i in reads]
         if all(value is not None for value in values):
-            with np.errstate(all="ignore"):
-                return self.constant(np.asarray(getattr(np, _ELEMENTWISE[name])(*values)))
+            return self.constant(np.asarray(Operation(name, reads).value(values)))
         if name in ("add", "mul", "max", "min"):  # the order does not matter
             reads = tuple(sorted(reads, key=lambda i: (self.value(i) is None, i)))
             values = [self.value(i) for i in reads]
