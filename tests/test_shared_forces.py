@@ -8,6 +8,7 @@ import pytest
 import orthaug as oa
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.term_sensitivities import acting_slopes
+from orthaug.physics.differences import Difference, Side
 from orthaug.physics.shared_forces import SharedForce, shared_forces, with_input
 
 
@@ -29,6 +30,49 @@ def two_masses(**define: str) -> oa.Motion:
     )
 
 
+DAMPER = Difference(Side("v", "v", 1.0), Side("w", "w", 1.0))
+
+
+def geared(**own: str) -> oa.Motion:
+    """A motor that turns a load through a gear and a spring."""
+    equations = {
+        "v": "(u - k/N*(x/N - z))/J",
+        "w": "k*(x/N - z)/m",
+    } | own
+    return oa.Motion.from_equations(
+        [oa.State("x", "v"), oa.State("v", equations["v"]), oa.State("z", "w")]
+        + [oa.State("w", equations["w"])],
+        [oa.Output("motor", "x"), oa.Output("load", "z")],
+        [oa.PhysicalParameter(name, 1.0, min=0) for name in ("J", "m", "k")],
+        ["u"],
+        constants={"N": 4.0},
+    )
+
+
+def test_a_force_behind_a_gear_is_one_force() -> None:
+    motion = geared()
+    (force,) = shared_forces(motion)
+    assert str(force) == "k*(x/N - z)"
+    longer = with_input(motion, force)
+    x, u, p = np.array([0.3, -0.2, 0.1, 0.4]), np.array([0.5]), motion.initial
+    rates = longer.rates(x, np.append(u, 0.8), p, np) - motion.rates(x, u, p, np)
+    np.testing.assert_allclose(rates, [0, -0.2, 0, 0.8], atol=1e-15)
+    (stretch,) = motion.differences
+    np.testing.assert_array_equal(stretch.row(("x", "v", "z")), [0.25, 0, -1])
+
+
+@pytest.mark.parametrize("side", ["x*N", "2*x/N", "N*2*x", "x"])
+def test_ratios_of_a_gear_may_be_written_as_one_likes(side: str) -> None:
+    motion = geared(v=f"(u - k*({side} - z))/J", w=f"k*({side} - z)/m")
+    assert [str(force) for force in shared_forces(motion)] == [f"k*({side} - z)"]
+
+
+def test_what_is_no_difference_of_two_names_is_none() -> None:
+    for text in ("k*(x/J - z)", "k*(x/0 - z)", "k*(x**2 - z)", "k*(x - 2*x)", "k*(x - N)"):
+        motion = geared(v=f"(u - {text})/J", w=f"{text}/m")
+        assert motion.differences == () and shared_forces(motion) == ()
+
+
 def test_forces_of_several_equations_are_found_either_way_round() -> None:
     assert [str(force) for force in shared_forces(two_masses())] == ["k*(x - z)", "c*(v - w)"]
 
@@ -46,7 +90,7 @@ def test_functions_have_none() -> None:
 
 def test_what_is_added_acts_in_every_equation() -> None:
     motion = two_masses()
-    force = SharedForce("c", "v", "w")
+    force = SharedForce("c", DAMPER)
     longer = with_input(motion, force)
     x, u, p = np.array([0.3, -0.2, 0.1, 0.4]), np.array([0.5]), motion.initial
     added = np.append(u, 0.7)
@@ -63,14 +107,18 @@ def test_what_is_added_acts_in_every_equation() -> None:
     ("text", "expected"),
     [
         ("k*(v - w)", "k*(v - w)"),
-        ("2*c*(v - w)", "2*c*(v - w)"),  # a product with more in it
+        ("2*c*(v - w)", "(2*c*(v - w) + 2*(h))"),
+        ("c/N*(v - w) - u", "(c/N*(v - w) + (h)/N) - u"),
+        ("c*N/(2*N)*(w - v)", "(c*N/(2*N)*(w - v) - N*(h)/(2*N))"),
+        ("m*c*(v - w)", "m*c*(v - w)"),  # a parameter more is another force
+        ("c*(v/N - w)", "c*(v/N - w)"),
         ("a  +  c *( w-v )", "a + (c *( w-v ) - h)"),
         ("(v - w)*c/ä", "((v - w)*c + h)/ä"),
         ("ä*x - c*(v - w)", "ä*x - (c*(v - w) + h)"),
     ],
 )
 def test_a_force_is_changed_where_it_is(text: str, expected: str) -> None:
-    assert SharedForce("c", "v", "w").with_added(text, "h") == expected
+    assert SharedForce("c", DAMPER).with_added(text, "h", {"N": 3.0}) == expected
 
 
 def test_a_damper_that_grows_with_its_speed_is_one_missing_term() -> None:

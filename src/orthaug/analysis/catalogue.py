@@ -9,7 +9,6 @@ physics.
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -211,7 +210,7 @@ class Catalogue:
         names, features = motion.names_of_states, list(dict.fromkeys(features))
         hidden = {*names, *motion.inputs} - {*motion.visible}
         more = [text for text in features if text not in (*names, *motion.inputs)]
-        more += [text for text in _differences(motion) if text not in more]
+        more += [text for text in map(str, motion.differences) if text not in more]
         places = tuple(motion.states[place].name for place in usual_places(motion))
         read = {
             place: motion.names_in(motion.equations[place])
@@ -350,26 +349,3 @@ def soften_jumps(
                 replace(suspect, name=f"{suspect.name} as {soft}", expression=text, jump=None)
             )
     return tuple(found)
-
-
-def _differences(motion: Motion) -> list[str]:
-    """Return the differences of states and inputs in the equations, as of two temperatures.
-
-    What drives heat, or stretches a spring, is likely what a missing term depends on. Of a pair,
-    which the equations of two masses have either way round, the first one counts.
-    """
-    if motion.functions is not None:
-        return []
-    known = {*motion.names_of_states, *motion.inputs}
-    pairs = [
-        (node.left.id, node.right.id)
-        for expression in motion.equations.values()
-        for node in ast.walk(expression.tree)
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
-        if isinstance(node.left, ast.Name) and isinstance(node.right, ast.Name)
-        if {node.left.id, node.right.id} <= known
-    ]
-    first: dict[frozenset[str], tuple[str, str]] = {}
-    for pair in pairs:
-        first.setdefault(frozenset(pair), pair)
-    return [f"{left} - {right}" for left, right in first.values()]

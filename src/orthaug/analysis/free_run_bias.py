@@ -186,8 +186,7 @@ class MotionTerms:
         place = equations_of(motion)[acts[0]]
         named = (*motion.names_of_states, *motion.inputs)
         read = [name for name in named if name in motion.visible]
-        pairs = [pair for pair in motion.differences if {*pair} <= {*read}]
-        features = [*(f"{a} - {b}" for a, b in pairs), *read]
+        features = [*map(str, motion.differences), *read]
         catalogue = Catalogue.of_motion(motion, self.value, x, u, features)
         catalogue = replace(catalogue, places=(place,))
         every = (*catalogue.usual(), *catalogue.products_of(read), *catalogue.families(RIVALS))

@@ -237,10 +237,9 @@ def variables_of(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
     """
     every, names = (*motion.names_of_states, *motion.inputs), motion.visible
     unit = np.eye(len(every))
-    pairs = [pair for pair in motion.differences if set(pair) <= set(names)]
     rows = [unit[every.index(name)] for name in names]
-    rows += [unit[every.index(a)] - unit[every.index(b)] for a, b in pairs]
-    return (*names, *(f"({a} - {b})" for a, b in pairs)), np.stack(rows)
+    rows += [one.row(every) for one in motion.differences]
+    return (*names, *(f"({one})" for one in motion.differences)), np.stack(rows)
 
 
 def products_of(names: tuple[str, ...]) -> list[Product]:

@@ -300,7 +300,7 @@ def _force_along(fit: MotionEstimate, number: int, term: MissingTerm) -> str | N
         return None
     forces = zip(shared_forces(motion), _same_force(fit), strict=True)
     alike = (f for f, first in forces if first == number)
-    return next((str(f) for f in alike if f"({f.first} - {f.second})" == term.variable), None)
+    return next((str(f) for f in alike if f"({f.difference})" == term.variable), None)
 
 
 def _moved_by(fit: MotionEstimate, equation: int) -> Vector:

@@ -147,7 +147,8 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
             )
         for force in shared_forces(motion):
             if place == str(force):
-                change = self._rewritten(job, partial(force.with_added, added=added))
+                own = partial(force.with_added, added=added, constants=dict(motion.constants))
+                change = self._rewritten(job, own)
                 return change, f"beside every {place}"
         if place not in motion.names_of_states:
             return None

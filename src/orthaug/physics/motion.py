@@ -37,6 +37,7 @@ from orthaug.data.expressions import (
 )
 from orthaug.data.record import Record
 from orthaug.physics.baseline import check_sampling_constant
+from orthaug.physics.differences import Difference, differences_in
 from orthaug.physics.integrators import INTEGRATORS, Integrator
 from orthaug.physics.mass_matrix import NO_MASS, MassMatrix
 from orthaug.physics.parameters import (
@@ -415,20 +416,16 @@ class Motion(NotebookView):
         return {name: text for name, text in texts.items() if text in self.names_of_states}
 
     @property
-    def differences(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of names a, b whose difference a − b occurs in an expression, each once.
+    def differences(self) -> tuple[Difference, ...]:
+        """Differences of two visible states or inputs that occur in an expression, each once.
 
         Empty for a motion with functions.
         """
         if self.functions is not None:
             return ()
-        found: dict[frozenset[str], tuple[str, str]] = {}
-        for expression in (*self.equations.values(), *(one for _, one in self.definitions)):
-            for node in ast.walk(expression.tree):
-                match node:
-                    case ast.BinOp(ast.Name(a), ast.Sub(), ast.Name(b)):
-                        found.setdefault(frozenset((a, b)), (a, b))
-        return tuple(found.values())
+        every = (*self.equations.values(), *(one for _, one in self.definitions))
+        found = differences_in(every, dict(self.constants))
+        return tuple(one for one in found if one.names <= {*self.visible})
 
     @property
     def visible(self) -> tuple[str, ...]:
