@@ -454,7 +454,12 @@ REFUSED_TEXT = [
     ("run.csv", 'u,y\n1,2\n3,"4\n5,6\n', "not a readable table.*row 2"),
     ("run.csv", "force,position\n1,2\n", "no column 'u'; the file has 'force', 'position'"),
     ("run.csv", "U,y\n1,2\n", "no column 'u', did you mean 'U'. The file has 'U', 'y'"),
-    ("run.csv", "u (N),y\n1,2\n", r"no column 'u', did you mean 'u \(N\)'\?"),
+    (
+        "run.csv",
+        "u (N),y\n1,2\n",
+        r"no column 'u', did you mean 'u \(N\)'\? .* Write into `\[data.channels\]` of the spec: "
+        r'u = \{ column = "u \(N\)", unit = "N" \}\.',
+    ),
     ("run.csv", ",,\n1,2,3\n", "no column 'u'; the file has no column names"),
     ("run.csv", "u,y,y\n1,2,3\n", "column 'y' 2 times; names must differ"),
     ("run.txt", "1 2\n3 4\n5 6 7\n", "no column 'u': the file has no header"),

@@ -26,7 +26,7 @@ from orthaug._base.errors import (
 from orthaug._base.memory import check_memory
 from orthaug._base.plugins import READERS, discover
 from orthaug._base.progress import LOG
-from orthaug.data.headers import header_with_unit, in_seconds, parse_dates
+from orthaug.data.headers import header_with_unit, in_seconds, parse_dates, split_header
 from orthaug.data.layouts import (
     Layout,
     as_number,
@@ -501,6 +501,18 @@ KNOWN = tuple(_READERS)
 """Endings of the files that can be read."""
 
 
+def _with_unit(name: str, header: Sequence[str]) -> str:
+    """Return how a spec takes the one column that has a name but for its unit; else nothing."""
+    alike = [(h, unit) for h in header for base, unit in [split_header(h)] if unit and base == name]
+    if len(alike) != 1 or not name.isidentifier() or '"' in alike[0][0]:
+        return ""
+    column, unit = alike[0]
+    return (
+        f" Write into `[data.channels]` of the spec: {name} = "
+        f'{{ column = "{column}", unit = "{unit}" }}.'
+    )
+
+
 def check_present(
     path: Path,
     columns: Sequence[str],
@@ -527,6 +539,7 @@ def check_present(
             known += f" and {len(header) - _NAMED} more" if len(header) > _NAMED else ""
             raise MissingColumnError(
                 f"{path}: no column '{name}'{nearest(name, header)}; the file has {known}."
+                f"{_with_unit(name, header)}"
             )
         if list(header).count(name) > 1:
             twice = (
