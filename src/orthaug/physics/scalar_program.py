@@ -569,9 +569,9 @@ def _known_step(equation: Any, arguments: Sequence[np.ndarray]) -> Sequence[np.n
 
 def _bound(equation: Any, arguments: Sequence[Any]) -> Sequence[Any]:
     """Return the outputs of a step by JAX."""
-    found = equation.primitive.bind(
-        *arguments, **equation.primitive.get_bind_params(equation.params)
-    )
+    bound = equation.primitive.get_bind_params(equation.params)
+    functions, options = bound if isinstance(bound, tuple) else ((), bound)  # JAX 0.8, and later
+    found = equation.primitive.bind(*functions, *arguments, **options)
     return found if equation.primitive.multiple_results else [found]
 
 
