@@ -825,6 +825,10 @@ BAD = {  # what is put in the place of files ("" replaces a piece of the spec), 
         {"": ('kind = "none"', 'inputs = ["w[k]"]')},
         ["learner input", "channel 'w'"],
     ),
+    "learner input missing": (
+        {"": ('kind = "none"', "inputs = []")},
+        ["the learner has no inputs; give `inputs` such as y[k-1]"],
+    ),
     "lags for other channels": (
         {"": ('kind = "none"', "[lags]\nna = [1, 1]")},
         ["`na` has 2 numbers for 1 output;"],

@@ -470,6 +470,11 @@ def regressor_of(
     )
     features = Features.of(chosen)
     if learner_inputs is not None:
+        if not learner_inputs:
+            raise InputError(
+                "the learner has no inputs; give `inputs` such as y[k-1], or leave the key out "
+                "for all lags."
+            )
         constants = dict(baseline.constants)
         try:
             expressions = [parse(text, constants) for text in learner_inputs]
