@@ -1036,6 +1036,9 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
         "imitates a and b; other forms of a term that fit as well count in their intervals."
     )
     assert "does not surely improve it, and which is as good without the learner." in trials.text
+    tried.append(ProposalErrors(Proposal("u**2", {}), [1.001 * base[0]]))
+    (_,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
+    assert "No sure gain over" in trials.text and "u**2 beside the learner (" in trials.text
 
 
 def test_a_change_that_is_surely_worse_is_said_to_be():

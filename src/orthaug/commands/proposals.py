@@ -34,6 +34,7 @@ _OTHER_NOISE = (
 )
 _OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 _OTHER_UNIT = "It was not tried, because errors in another unit cannot be compared."
+IN_PLACE = "in place of the learner"
 _TERMS = 3  # suspected terms that are proposed
 _MOST = 0.5  # of the learner: what explains more may take its place, as a trial shows
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
@@ -365,7 +366,7 @@ def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator
                 words.append(term.words)
     if words:
         change |= {"learner.kind": "none"}
-        yield Proposal(f"{join_words(words)} in place of the learner", change, replaces=True)
+        yield Proposal(f"{join_words(words)} {IN_PLACE}", change, replaces=True)
 
 
 def _term(
