@@ -1107,6 +1107,44 @@ def test_a_learner_without_the_heading_is_proposed_where_no_equation_reads_it(tm
     assert proposed(SHIP.replace("hidden = [2]", 'kind = "none"')) == []
 
 
+SHAFT = """
+[data]
+sampling_time = 0.1
+inputs = ["rudder"]
+outputs = ["heading"]
+train = { files = ["run.csv"] }
+[motion.states]
+a = { derivative = "w", start = "heading" }
+w = { derivative = "rudder - b*w - k*(a - l)", learned = true }
+l = { derivative = "q" }
+q = { derivative = "k*(a - l)", learned = true }
+[motion.outputs]
+heading = "a"
+[motion.parameters]
+k = { initial = 1.0, min = 0 }
+b = { initial = 1.0, min = 0 }
+[learner]
+hidden = [2]
+"""
+
+
+def test_a_learner_that_sees_the_twist_of_a_free_shaft_is_proposed(tmp_path):
+    """Motor and load turned on and on; over other angles the learner knew nothing."""
+    data = turning_ship(60)
+
+    def proposed(text: str) -> list[Proposal]:
+        job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading")))
+        return list(_without_headings(job))
+
+    (proposal,) = proposed(SHAFT)
+    assert proposal.change == {"learner.inputs": ["a - l", "w", "q", "rudder"]}
+    assert "sees a - l in place of a and l (equations read only" in proposal.words
+    assert proposed(SHAFT.replace("- b*w", "- b*w - b*a")) == []  # a spring holds the motor
+    assert proposed(SHAFT.replace('"k*(a - l)"', '"k*(a - l) + b*(rudder - l)"')) == []  # an input
+    (proposal,) = proposed(SHAFT.replace("k*(a - l)", "k*(w - q)"))
+    assert proposal.change == {"learner.inputs": ["w", "q", "rudder"]}
+
+
 def test_a_learner_that_sees_a_heading_is_advised_to_see_it_no_more(tmp_path):
     """No change was tried, for this learner does not go on from two thirds of the rows."""
     result = oa.fit_spec(str(put(tmp_path, SHIP, turning_ship(400), "rudder,heading"))).result
