@@ -173,7 +173,7 @@ def test_degrees_that_a_parameter_without_them_turns_into_radians_are_named(tmp_
     rudder, rate = np.repeat(rng.uniform(-6, 6, 20), 10), [0.0]
     for u in rudder[:-1]:
         rate.append(rate[-1] + 0.05 * (0.02 * u - 0.9 * rate[-1]))
-    write_csv(tmp_path / "run.csv", rudder=rudder, rate=rate)
+    write_csv(tmp_path / "run.csv", rudder=rudder, rate=np.array(rate))
     spec = tmp_path / "spec.toml"
     (text,) = said(spec, TURN)
     assert "'rudder' is in deg, and N_d times it, N_d in 1/s2" in text
