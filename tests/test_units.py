@@ -179,6 +179,9 @@ def test_an_input_per_hour_is_named_where_time_was_converted_to_seconds(
     assert len(found) == said
     if unit == "mg/h" and said:
         assert "'u' is in mg/h" in found[0] and "`scale = 0.000277778`" in found[0]
+        record = replace(record, inputs=(Channel("u", unit, scale=1 / 3600),))
+        warnings = sample_warnings(pose_motion(record, motion))
+        assert all(one.code != "time_unit" for one in warnings)
 
 
 def test_equations_in_minutes_have_linear_views_in_minutes():

@@ -195,10 +195,11 @@ def _other_rates(problem: PosedProblem) -> list[Warning]:
 
     Equations with a factor that converts are left to the user.
     """
-    column, motion = problem.record.time_column, problem.physics
-    if not isinstance(problem, MotionProblem) or motion.functions is not None:
+    column = problem.record.time_column
+    if not isinstance(problem, MotionProblem) or time_unit(["1/h"], column) != "s":
         return []
-    if motion.source is not None or motion.scheme.discrete or time_unit(["1/h"], column) != "s":
+    motion = problem.motion
+    if motion.functions is not None or motion.source is not None or motion.scheme.discrete:
         return []
     read = {name for state in motion.equations for name in motion.names_in(motion.equations[state])}
     numbers = [float(value) for _, value in motion.constants]
@@ -217,6 +218,7 @@ def _other_rates(problem: PosedProblem) -> list[Warning]:
         if channel.name in read
         and (seconds := time_of_rate(channel.unit)) is not None
         and not any(np.isclose(number, (seconds, 1 / seconds)).any() for number in numbers)
+        and not np.isclose(channel.scale * seconds, 1.0, rtol=1e-3)
     ]
 
 
