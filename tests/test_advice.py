@@ -1036,6 +1036,9 @@ def test_a_term_as_good_as_the_learner_is_no_gain_and_no_chance():
         "imitates a and b; other forms of a term that fit as well count in their intervals."
     )
     assert "does not surely improve it, and which is as good without the learner." in trials.text
+    tried.append(ProposalErrors(Proposal("u**2", {}), [1.001 * base[0]]))
+    (_,), trials = _conclude_trials(base, tried, rows, 0, True, **options)
+    assert "No sure gain over" in trials.text and "u**2 beside the learner (" in trials.text
 
 
 def test_a_change_that_is_surely_worse_is_said_to_be():
@@ -1102,6 +1105,44 @@ def test_a_learner_without_the_heading_is_proposed_where_no_equation_reads_it(tm
     assert proposed(SHIP.replace("- a*r", "- a*r - 0.1*psi")) == []
     assert proposed(SHIP.replace("[2]", '[2]\ninputs = ["r"]')) == []
     assert proposed(SHIP.replace("hidden = [2]", 'kind = "none"')) == []
+
+
+SHAFT = """
+[data]
+sampling_time = 0.1
+inputs = ["rudder"]
+outputs = ["heading"]
+train = { files = ["run.csv"] }
+[motion.states]
+a = { derivative = "w", start = "heading" }
+w = { derivative = "rudder - b*w - k*(a - l)", learned = true }
+l = { derivative = "q" }
+q = { derivative = "k*(a - l)", learned = true }
+[motion.outputs]
+heading = "a"
+[motion.parameters]
+k = { initial = 1.0, min = 0 }
+b = { initial = 1.0, min = 0 }
+[learner]
+hidden = [2]
+"""
+
+
+def test_a_learner_that_sees_the_twist_of_a_free_shaft_is_proposed(tmp_path):
+    """Motor and load turned on and on; over other angles the learner knew nothing."""
+    data = turning_ship(60)
+
+    def proposed(text: str) -> list[Proposal]:
+        job = oa.load_spec(str(put(tmp_path, text, data, "rudder,heading")))
+        return list(_without_headings(job))
+
+    (proposal,) = proposed(SHAFT)
+    assert proposal.change == {"learner.inputs": ["a - l", "w", "q", "rudder"]}
+    assert "sees a - l in place of a and l (equations read only" in proposal.words
+    assert proposed(SHAFT.replace("- b*w", "- b*w - b*a")) == []  # a spring holds the motor
+    assert proposed(SHAFT.replace('"k*(a - l)"', '"k*(a - l) + b*(rudder - l)"')) == []  # an input
+    (proposal,) = proposed(SHAFT.replace("k*(a - l)", "k*(w - q)"))
+    assert proposal.change == {"learner.inputs": ["w", "q", "rudder"]}
 
 
 def test_a_learner_that_sees_a_heading_is_advised_to_see_it_no_more(tmp_path):

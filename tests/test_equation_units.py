@@ -147,3 +147,39 @@ def test_a_motion_too_fast_for_its_sampling_names_rates_of_another_time(tmp_path
     (tmp_path / "spec.toml").write_text(text, encoding="utf-8")
     done = run("check", tmp_path / "spec.toml")
     assert done.code == 2 and "Parameters are in 1/h" in done.err
+
+
+TURN = """
+[data]
+sampling_time = 0.05
+inputs = ["rudder"]
+outputs = ["rate"]
+train = "run.csv"
+[data.channels]
+rudder = { unit = "deg" }
+rate = { unit = "rad/s" }
+[motion.states]
+r = { derivative = "N_d*rudder - N_r*r", start = "rate", unit = "rad/s" }
+[motion.outputs]
+rate = "r"
+[motion.parameters]
+N_d = { initial = 0.8, unit = "1/s2" }
+N_r = { initial = 0.8, unit = "1/s", min = 0 }
+"""
+
+
+def test_degrees_that_a_parameter_without_them_turns_into_radians_are_named(tmp_path):
+    rng = np.random.default_rng(3)
+    rudder, rate = np.repeat(rng.uniform(-6, 6, 20), 10), [0.0]
+    for u in rudder[:-1]:
+        rate.append(rate[-1] + 0.05 * (0.02 * u - 0.9 * rate[-1]))
+    write_csv(tmp_path / "run.csv", rudder=rudder, rate=np.array(rate))
+    spec = tmp_path / "spec.toml"
+    (text,) = said(spec, TURN)
+    assert "'rudder' is in deg, and N_d times it, N_d in 1/s2" in text
+    assert "`scale = 0.0174533`" in text
+    assert said(spec, TURN.replace('{ unit = "deg" }', '{ unit = "rad", scale = 0.0174533 }')) == []
+    assert said(spec, TURN.replace("1/s2", "rad/(s2 deg)")) == []
+    assert said(spec, TURN.replace(', unit = "1/s2"', "")) == []  # never guessed
+    assert said(spec, TURN.replace("N_d*rudder", "N_d*0.0174533*rudder")) == []
+    assert said(spec, TURN.replace("N_d*rudder", "N_d*(rudder + 1)")) == [text]

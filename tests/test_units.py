@@ -22,8 +22,10 @@ from orthaug import (
     linearize,
     load_spec,
 )
+from orthaug.analysis.evidence import sample_warnings
 from orthaug.data.units import conversion, unit_faults
 from orthaug.data.wild import data_warnings
+from orthaug.physics.problem import pose_motion
 from orthaug.reports.linear import LinearizeResult
 from orthaug.reports.linear_text import linear_text
 
@@ -154,6 +156,32 @@ def test_a_unit_with_minutes_in_it_is_named_as_not_converted():
     fit = estimate(record, cooled(unit="1/s", other="K/min"), learner=None)
     (found,) = [w for w in fit.diagnose().warnings if w.code == "time_unit"]
     assert "the units of b have another time" in found.text
+
+
+@pytest.mark.parametrize(
+    ("unit", "equation", "column", "said"),
+    [
+        ("mg/h", "b*u - a*x", "time [h]", True),
+        ("l/min", "b*u - a*x", "time [h]", True),
+        ("mg/h", "b*u/3600 - a*x", "time [h]", False),  # converted
+        ("mg/h", "b*u - a*x", "time", False),  # hours, for all that is known
+        ("1/min", "b*u - a*x", "time [h]", False),  # a speed in turns
+        ("mg/s", "b*u - a*x", "time [h]", False),
+    ],
+)
+def test_an_input_per_hour_is_named_where_time_was_converted_to_seconds(
+    unit, equation, column, said
+):
+    record = minutes(step=30.0, column=column)
+    record = replace(record, inputs=(Channel("u", unit),))
+    motion = cooled(unit="1/s", equation=equation)
+    found = [w.text for w in sample_warnings(pose_motion(record, motion)) if w.code == "time_unit"]
+    assert len(found) == said
+    if unit == "mg/h" and said:
+        assert "'u' is in mg/h" in found[0] and "`scale = 0.000277778`" in found[0]
+        record = replace(record, inputs=(Channel("u", unit, scale=1 / 3600),))
+        warnings = sample_warnings(pose_motion(record, motion))
+        assert all(one.code != "time_unit" for one in warnings)
 
 
 def test_equations_in_minutes_have_linear_views_in_minutes():

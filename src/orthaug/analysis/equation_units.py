@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from collections.abc import Iterator
 from typing import Protocol
 
@@ -12,6 +13,7 @@ from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression
 from orthaug.data.record import Record
 from orthaug.data.units import conversion
+from orthaug.physics.motion import Motion
 
 _OF_ANGLES = ("sin", "cos", "tan")
 _NEAR = 0.01  # relative error of a factor that was rounded
@@ -39,8 +41,9 @@ class Written(Protocol):
 def equation_units(record: Record, physics: Written) -> list[Warning]:
     """Return a warning for each quantity whose unit in the data is not that of the equations.
 
-    Two cases are certain: an output that is a state of another declared unit, and the sine, cosine
-    or tangent of a quantity in degrees. A unit that is not declared is never guessed.
+    Three cases are certain: an output that is a state of another declared unit, the sine, cosine or
+    tangent of a quantity in degrees, and degrees times a parameter without them in the equation of
+    a state in radians. A unit that is not declared is never guessed.
     """
     channels = {channel.name: channel for channel in record.channels}
     measured = {state: channels[out] for out, state in physics.measured_states.items()}
@@ -52,6 +55,11 @@ def equation_units(record: Record, physics: Written) -> list[Warning]:
         if channel.name not in doubted and _degrees(channel)
     }
     found += _sines_of_degrees(physics.expressions, angles)
+    if isinstance(physics, Motion) and physics.functions is None and physics.source is None:
+        doubted = {name for name, _ in found}
+        found += _degrees_among_radians(
+            physics, {name: angle for name, angle in angles.items() if angle.name not in doubted}
+        )
     return [Warning("equation_units", text) for _, text in found]
 
 
@@ -111,6 +119,55 @@ def _sines_of_degrees(
                             f"`scale = {scale:.6g}`, or write "
                             f"{function}({math.pi / 180:.6g}*({ast.unparse(argument)})).",
                         )
+
+
+def _degrees_among_radians(motion: Motion, angles: dict[str, Channel]) -> Iterator[tuple[str, str]]:
+    """Yield each channel in degrees that makes radians by a parameter without degrees."""
+    units = {one.name: one.unit for one in motion.parameters if one.unit}
+    said = set()
+    for state, unit in motion.state_units.items():
+        if not re.match(r"rad\b", unit):
+            continue
+        for factors in _products(motion.equations[state].tree):
+            # Another number or constant among them may convert
+            names = [name for factor in factors for name in _unconverted(factor)]
+            if len(names) < len(factors) or not set(names) <= units.keys() | angles.keys():
+                continue
+            channel = next((angles[name] for name in names if name in angles), None)
+            other = next((name for name in names if name in units), None)
+            if channel is None or other is None or channel.name in said:
+                continue
+            if any(re.search("deg|°", units.get(name, "")) for name in names):
+                continue
+            said.add(channel.name)
+            scale = channel.scale * math.pi / 180
+            yield (
+                channel.name,
+                f"'{channel.name}' is in {channel.unit}, and {other} times it, {other} in "
+                f"{units[other]}, is in the equation of '{state}' in {unit}. The parameters absorb "
+                f'such a factor. Give `data.channels.{channel.name}` `unit = "rad"` and '
+                f"`scale = {scale:.6g}`, or give {other} a unit with {channel.unit}.",
+            )
+
+
+def _products(node: ast.AST) -> Iterator[list[ast.expr]]:
+    """Yield the factors of each product in an expression."""
+    match node:
+        case ast.BinOp(_, ast.Mult(), _):
+            yield _factors(node)
+        case _:
+            for child in ast.iter_child_nodes(node):
+                yield from _products(child)
+
+
+def _factors(node: ast.expr) -> list[ast.expr]:
+    match node:
+        case ast.BinOp(left, ast.Mult(), right):
+            return [*_factors(left), *_factors(right)]
+        case ast.UnaryOp(_, operand):
+            return _factors(operand)
+        case _:
+            return [node]
 
 
 def _unconverted(node: ast.expr) -> Iterator[str]:

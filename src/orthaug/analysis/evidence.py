@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
 
 from orthaug._base.checks import check_count, check_type
 from orthaug._base.errors import InputError, Warning
@@ -20,6 +23,7 @@ from orthaug.analysis.wild_rows import fit_without
 from orthaug.data.part import Part
 from orthaug.data.preparation import warnings_of
 from orthaug.data.record import Record
+from orthaug.data.units import time_of_rate
 from orthaug.data.wild import data_warnings
 from orthaug.fitting.criteria import Criterion
 from orthaug.fitting.estimates import Estimate
@@ -32,8 +36,8 @@ from orthaug.inference.measures import Measure, Training
 from orthaug.models.learners import Learner, declared
 from orthaug.models.rows import InMemory
 from orthaug.models.tasks import runs_on
-from orthaug.physics.parameters import PhysicsMap
-from orthaug.physics.problem import PosedProblem, Problem
+from orthaug.physics.parameters import PhysicsMap, time_unit
+from orthaug.physics.problem import MotionProblem, PosedProblem, Problem
 
 if TYPE_CHECKING:
     from orthaug._base.parallel import Threads
@@ -157,7 +161,7 @@ def sample_warnings(problem: PosedProblem) -> list[Warning]:
     """
     effect = partial(fit_without, problem) if isinstance(problem, Problem) else None
     wild = data_warnings(problem.record, effect, limited=problem.set_by_controller)
-    return [*_unread(problem), *_other_times(problem), *wild]
+    return [*_unread(problem), *_other_times(problem), *_other_rates(problem), *wild]
 
 
 def _unread(problem: PosedProblem) -> list[Warning]:
@@ -184,6 +188,38 @@ def _other_times(problem: PosedProblem) -> list[Warning]:
         "the values are those with s. Give these units with s."
     )
     return [Warning("time_unit", text)]
+
+
+def _other_rates(problem: PosedProblem) -> list[Warning]:
+    """Return a warning on each input per hour, say, that derivatives per second read.
+
+    Equations with a factor that converts are left to the user.
+    """
+    column = problem.record.time_column
+    if not isinstance(problem, MotionProblem) or time_unit(["1/h"], column) != "s":
+        return []
+    motion = problem.motion
+    if motion.functions is not None or motion.source is not None or motion.scheme.discrete:
+        return []
+    read = {name for state in motion.equations for name in motion.names_in(motion.equations[state])}
+    numbers = [float(value) for _, value in motion.constants]
+    for expression in motion.expressions:
+        nodes = [one for one in ast.walk(expression.tree) if isinstance(one, ast.Constant)]
+        numbers += [float(one.value) for one in nodes if isinstance(one.value, (int, float))]
+    return [
+        Warning(
+            "time_unit",
+            f"The input '{channel.name}' is in {channel.unit}, but equations are per second, "
+            f"because the instants of column '{column}' are read in seconds. This is not "
+            f"converted, and parameters absorb the factor. Give `data.channels.{channel.name}` "
+            f"`scale = {channel.scale / seconds:.6g}` and its unit with s.",
+        )
+        for channel in problem.record.inputs
+        if channel.name in read
+        and (seconds := time_of_rate(channel.unit)) is not None
+        and not any(np.isclose(number, (seconds, 1 / seconds)).any() for number in numbers)
+        and not np.isclose(channel.scale * seconds, 1.0, rtol=1e-3)
+    ]
 
 
 def _problem_of(fit: Estimate) -> Any:

@@ -21,6 +21,7 @@ from orthaug._base.progress import LOG, Stage
 from orthaug.analysis.findings import AdviceResult, AdviceTrialsResult
 from orthaug.commands.job import PHYSICS_ONLY, Job, Variant
 from orthaug.commands.proposals import (
+    IN_PLACE,
     Proposal,
     changed_job,
     mending_proposals,
@@ -362,7 +363,14 @@ def _conclude_trials(
         else "."
     )
     if worse:
-        words = [f"{one.proposal.words} ({_error_text(one, base)})" for one in worse]
+        replacing = [one.proposal.words for one in tried if one.proposal.replaces]
+        words = [
+            f"{one.proposal.words}"
+            # The same term was tried in both ways
+            f"{' beside the learner' if f'{one.proposal.words} {IN_PLACE}' in replacing else ''}"
+            f" ({_error_text(one, base)})"
+            for one in worse
+        ]
         text += f" No sure gain over {_error(before)}: {first_words(words, _LISTED, '; ')}."
         if any(_hurts(one, base) for one in worse[:_LISTED]):
             text += f" {_NOT_TO_BE_MADE}"

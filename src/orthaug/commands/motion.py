@@ -324,13 +324,15 @@ class MotionPhysics(JobPhysics[MotionProblem, "MotionEstimate"]):
         segmented = SegmentedMotion.of(problem.without_learner(), nothing_learned(), criterion)
         identification = identify_ranks(segmented)
         if identification is None:
-            wild = "".join(
-                f" {warning.text}" for warning in job.warnings if warning.code == "wild_samples"
-            )
+            of_data = {
+                code: "".join(f" {one.text}" for one in job.warnings if one.code == code)
+                for code in ("wild_samples", "time_unit")
+            }
             scales = describe_scales(problem.record)
             cause = f" {scales[0].upper()}{scales[1:]}" if scales else ""
             other = f"{problem.grows}." if problem.grows else f"give others.{cause}"
-            remedy = f"it meets a wild sample.{wild}" if wild else other
+            wild, times = of_data["wild_samples"], of_data["time_unit"]
+            remedy = f"it meets a wild sample.{wild}" if wild else f"{other}{times}"
             raise InputError(
                 f"{job.path}: physics alone has no finite free run from its initial values; "
                 f"{remedy}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import math
 from collections.abc import Iterator
 from copy import deepcopy
@@ -23,7 +24,7 @@ from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
 from orthaug.data.wild import mendings
 from orthaug.fitting.kinds import CRITERIA
-from orthaug.physics.motion import HOLDS
+from orthaug.physics.motion import HOLDS, Motion
 from orthaug.reports.result import FitResult
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ _OTHER_NOISE = (
 )
 _OTHER_OUTPUT = "It was not tried, because errors of another output cannot be compared."
 _OTHER_UNIT = "It was not tried, because errors in another unit cannot be compared."
+IN_PLACE = "in place of the learner"
 _TERMS = 3  # suspected terms that are proposed
 _MOST = 0.5  # of the learner: what explains more may take its place, as a trial shows
 _LITTLE = 0.05  # of what was learned or left: what explains less is not proposed
@@ -365,7 +367,7 @@ def _in_place_of_learner(job: Job, result: FitResult, fit: Estimate) -> Iterator
                 words.append(term.words)
     if words:
         change |= {"learner.kind": "none"}
-        yield Proposal(f"{join_words(words)} in place of the learner", change, replaces=True)
+        yield Proposal(f"{join_words(words)} {IN_PLACE}", change, replaces=True)
 
 
 def _term(
@@ -466,7 +468,8 @@ def _without_headings(job: Job) -> Iterator[Proposal]:
     """Yield a learner that does not see the states of a motion that no equation reads.
 
     A heading, or the position of what no spring holds, does not come back to where it was: what is
-    learned of it over some rows holds for no others.
+    learned of it over some rows holds for no others. Of a motor and its load on an elastic shaft
+    equations read the difference alone, and so may the learner.
     """
     problem = job.problem
     network = job.declaration.get("learner", {}).get("kind", _NETWORK) == _NETWORK
@@ -478,11 +481,50 @@ def _without_headings(job: Job) -> Iterator[Proposal]:
     read = motion.names_in(*motion.equations.values())
     seen = [feature.text for feature in problem.features]
     unread = [name for name in seen if name in motion.names_of_states and name not in read]
-    kept = [text for text in seen if text not in unread]
-    if unread and kept:
+    apart = [pair for pair in _free_differences(motion) if set(pair) <= set(seen)]
+    replaced = {name for pair in apart for name in pair}
+    kept = [f"{a} - {b}" for a, b in apart]
+    kept += [text for text in seen if text not in unread and text not in replaced]
+    if not kept:
+        return
+    words = []
+    if unread:
         reads = f"no equation reads {'it' if len(unread) == 1 else 'them'}"
-        words = f"a learner that does not see {join_words(unread)} ({reads})"
-        yield Proposal(words, {"learner.inputs": kept}, learns=True, narrows=True)
+        words.append(f"does not see {join_words(unread)} ({reads})")
+    if apart:
+        reads = f"equations read only their difference{'s' * (len(apart) > 1)}"
+        names = join_words([name for name in seen if name in replaced])
+        words.append(f"sees {join_words(kept[: len(apart)])} in place of {names} ({reads})")
+    if words:
+        change = {"learner.inputs": kept}
+        yield Proposal(f"a learner that {join_words(words)}", change, learns=True, narrows=True)
+
+
+def _free_differences(motion: Motion) -> list[tuple[str, str]]:
+    """Return the differences of states that equations read in no other way.
+
+    None of a state that is compared with an input, which holds it.
+    """
+    trees = [one.tree for one in motion.equations.values()]
+    trees += [one.tree for _, one in motion.definitions]
+    held = {name for tree in trees for name in _names_by_themselves(tree)}
+    held |= {*motion.visible} - {*motion.visible_states}
+    pairs = list(motion.differences)
+    while joined := {name for pair in pairs if held & {*pair} for name in pair} - held:
+        held |= joined
+    return [pair for pair in pairs if not held & {*pair}]
+
+
+def _names_by_themselves(node: ast.AST) -> Iterator[str]:
+    """Yield the names in an expression that are in no difference of two names."""
+    match node:
+        case ast.BinOp(ast.Name(), ast.Sub(), ast.Name()):
+            return
+        case ast.Name(name):
+            yield name
+        case _:
+            for child in ast.iter_child_nodes(node):
+                yield from _names_by_themselves(child)
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:

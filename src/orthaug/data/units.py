@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from orthaug._base.errors import Warning
 from orthaug.data.channels import Channel
-from orthaug.data.headers import header_with_unit, split_header
+from orthaug.data.headers import header_with_unit, split_header, unit_of_time
 from orthaug.data.tables import read_titles
 
 # What engineers write, as the library of units reads it
@@ -27,7 +27,21 @@ _WRITTEN = {
     "m3/s": "m^3/s",
 }
 _FORM = re.compile(r"[A-Za-z1µμΩ°%][\w°%*/^²³·() -]*")  # no remark, such as `a.u.`
+_RATE = re.compile(r"(?!1/|U/|rev/).*[^\W\d].*/(min|h|d)")
 _NEAR = 0.01  # relative error of a scale that was rounded
+
+
+def time_of_rate(unit: str) -> float | None:
+    """Return the time in s of a rate per minute, hour or day; None of other units.
+
+    A number of turns, 1/min, is a speed in a unit of its own.
+
+    Examples:
+        >>> time_of_rate("mg/h"), time_of_rate("m3/s"), time_of_rate("1/min")
+        (3600.0, None, None)
+    """
+    found = _RATE.fullmatch(unit.replace(" ", ""))
+    return None if found is None else unit_of_time(f"x [{found[1]}]")[1]
 
 
 class Conversion(NamedTuple):
