@@ -1139,6 +1139,8 @@ def test_a_learner_that_sees_the_twist_of_a_free_shaft_is_proposed(tmp_path):
     (proposal,) = proposed(SHAFT)
     assert proposal.change == {"learner.inputs": ["a - l", "w", "q", "rudder"]}
     assert "sees a - l in place of a and l (equations read only" in proposal.words
+    (geared,) = proposed(SHAFT.replace("k*(a - l)", "k*(a/4 - l)"))
+    assert geared.change == {"learner.inputs": ["a/4 - l", "w", "q", "rudder"]}
     assert proposed(SHAFT.replace("- b*w", "- b*w - b*a")) == []  # a spring holds the motor
     assert proposed(SHAFT.replace('"k*(a - l)"', '"k*(a - l) + b*(rudder - l)"')) == []  # an input
     (proposal,) = proposed(SHAFT.replace("k*(a - l)", "k*(w - q)"))

@@ -24,6 +24,7 @@ from orthaug.data.preparation import STEPS
 from orthaug.data.steps import Shift
 from orthaug.data.wild import mendings
 from orthaug.fitting.kinds import CRITERIA
+from orthaug.physics.differences import Difference, difference_of
 from orthaug.physics.motion import HOLDS, Motion
 from orthaug.reports.result import FitResult
 
@@ -481,9 +482,9 @@ def _without_headings(job: Job) -> Iterator[Proposal]:
     read = motion.names_in(*motion.equations.values())
     seen = [feature.text for feature in problem.features]
     unread = [name for name in seen if name in motion.names_of_states and name not in read]
-    apart = [pair for pair in _free_differences(motion) if set(pair) <= set(seen)]
-    replaced = {name for pair in apart for name in pair}
-    kept = [f"{a} - {b}" for a, b in apart]
+    apart = [one for one in _free_differences(motion) if one.names <= set(seen)]
+    replaced = {name for one in apart for name in one.names}
+    kept = [str(one) for one in apart]
     kept += [text for text in seen if text not in unread and text not in replaced]
     if not kept:
         return
@@ -500,31 +501,30 @@ def _without_headings(job: Job) -> Iterator[Proposal]:
         yield Proposal(f"a learner that {join_words(words)}", change, learns=True, narrows=True)
 
 
-def _free_differences(motion: Motion) -> list[tuple[str, str]]:
+def _free_differences(motion: Motion) -> list[Difference]:
     """Return the differences of states that equations read in no other way.
 
     None of a state that is compared with an input, which holds it.
     """
     trees = [one.tree for one in motion.equations.values()]
     trees += [one.tree for _, one in motion.definitions]
-    held = {name for tree in trees for name in _names_by_themselves(tree)}
+    held = {name for tree in trees for name in _names_by_themselves(tree, motion)}
     held |= {*motion.visible} - {*motion.visible_states}
-    pairs = list(motion.differences)
-    while joined := {name for pair in pairs if held & {*pair} for name in pair} - held:
+    every = motion.differences
+    while joined := {name for one in every if held & one.names for name in one.names} - held:
         held |= joined
-    return [pair for pair in pairs if not held & {*pair}]
+    return [one for one in every if not held & one.names]
 
 
-def _names_by_themselves(node: ast.AST) -> Iterator[str]:
-    """Yield the names in an expression that are in no difference of two names."""
-    match node:
-        case ast.BinOp(ast.Name(), ast.Sub(), ast.Name()):
-            return
-        case ast.Name(name):
-            yield name
-        case _:
-            for child in ast.iter_child_nodes(node):
-                yield from _names_by_themselves(child)
+def _names_by_themselves(node: ast.AST, motion: Motion) -> Iterator[str]:
+    """Yield the names in an expression that are in no difference of two states or inputs."""
+    found = difference_of(node, dict(motion.constants))
+    if found is not None and found.names <= {*motion.visible}:
+        return
+    if isinstance(node, ast.Name):
+        yield node.id
+    for child in ast.iter_child_nodes(node):
+        yield from _names_by_themselves(child, motion)
 
 
 def _learner_for_equation(job: Job, result: FitResult, fit: Any) -> Iterator[Proposal]:
