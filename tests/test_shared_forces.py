@@ -73,6 +73,11 @@ def test_what_is_no_difference_of_two_names_is_none() -> None:
         assert motion.differences == () and shared_forces(motion) == ()
 
 
+def test_the_beginning_of_a_longer_sum_is_a_difference_only_without_numbers() -> None:
+    assert geared(v="(u - N*v - k*x)/J", w="x/m").differences == ()
+    assert [str(one) for one in geared(v="(u - v - k*x)/J", w="x/m").differences] == ["u - v"]
+
+
 def test_forces_of_several_equations_are_found_either_way_round() -> None:
     assert [str(force) for force in shared_forces(two_masses())] == ["k*(x - z)", "c*(v - w)"]
 

@@ -45,6 +45,11 @@ class Difference:
         """The two sides; the same either way round."""
         return frozenset((self.first, self.second))
 
+    @property
+    def scaled(self) -> bool:
+        """True if a known number multiplies either side."""
+        return any(side.text != side.name for side in self.sides)
+
     def row(self, names: tuple[str, ...]) -> Vector:
         """Return what it multiplies each of several names by, (len(names),)."""
         found = np.zeros(len(names))
@@ -66,14 +71,25 @@ def difference_of(node: ast.AST, constants: Mapping[str, float]) -> Difference |
 def differences_in(
     expressions: Iterable[Expression], constants: Mapping[str, float]
 ) -> Iterator[Difference]:
-    """Yield the differences in expressions, each once, the way round that it has first."""
+    """Yield the differences in expressions, each once, the way round that it has first.
+
+    The beginning of a longer sum is one only without known numbers: `voltage - R*i - K*speed` has
+    no difference of voltage and current.
+    """
     seen: set[frozenset[Side]] = set()
     for expression in expressions:
+        summands = {
+            id(side)
+            for node in ast.walk(expression.tree)
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub)
+            for side in (node.left, node.right)
+        }
         for node in ast.walk(expression.tree):
             found = difference_of(node, constants)
-            if found is not None and found.sides not in seen:
-                seen.add(found.sides)
-                yield found
+            if found is None or found.sides in seen or (found.scaled and id(node) in summands):
+                continue
+            seen.add(found.sides)
+            yield found
 
 
 def _side(node: ast.expr, constants: Mapping[str, float]) -> Side | None:
