@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import orthaug as oa
+from orthaug.analysis.missing_term import products_of, variables_of
 from orthaug.analysis.missing_terms import missing_terms
 from orthaug.analysis.term_sensitivities import acting_slopes
 from orthaug.physics.differences import Difference, Side
@@ -71,6 +72,23 @@ def test_what_is_no_difference_of_two_names_is_none() -> None:
     for text in ("k*(x/J - z)", "k*(x/0 - z)", "k*(x**2 - z)", "k*(x - 2*x)", "k*(x - N)"):
         motion = geared(v=f"(u - {text})/J", w=f"{text}/m")
         assert motion.differences == () and shared_forces(motion) == ()
+
+
+def test_a_difference_times_an_input_is_tried() -> None:
+    """A flow carries heat by a difference of temperatures; as factors of two it is two terms."""
+    motion = oa.Motion.from_equations(
+        [oa.State("T", "(flow*(cold - T) - k*(T - room))/C")],
+        [oa.Output("y", "T")],
+        [oa.PhysicalParameter(name, 1.0, min=0) for name in ("k", "C")],
+        ["flow", "cold", "room", "lamp", "sun"],
+    )
+    names, _ = variables_of(motion)
+    found = [(names[i], names[j]) for i, j, *_ in products_of(motion)]
+    others = {"(cold - T)": ("flow", "room"), "(T - room)": ("flow", "cold")}
+    for difference, inputs in others.items():
+        mine = [b for a, b in found if a == difference]
+        assert mine == [*inputs, "lamp", "sun"]
+    assert len(found) == 8  # six variables are too many for their products
 
 
 def test_the_beginning_of_a_longer_sum_is_a_difference_only_without_numbers() -> None:

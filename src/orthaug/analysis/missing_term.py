@@ -242,12 +242,21 @@ def variables_of(motion: Motion) -> tuple[tuple[str, ...], Matrix]:
     return (*names, *(f"({one})" for one in motion.differences)), np.stack(rows)
 
 
-def products_of(names: tuple[str, ...]) -> list[Product]:
-    """Return the products of two variables, each linear or one squared; none of many variables."""
-    if len(names) > _MOST_FACTORS:
-        return []
-    pairs = itertools.combinations(range(len(names)), 2)
-    return [(i, j, a, b) for i, j in pairs for a, b in ((1, 1), (2, 1), (1, 2))]
+def products_of(motion: Motion) -> list[Product]:
+    """Return the products of two variables, numbered as by `variables_of`.
+
+    They are those of two states or inputs, each linear or one squared, unless there are many; and
+    of a difference in the equations and an input, such as a flow that carries heat.
+    """
+    names = motion.visible
+    few = range(len(names) if len(names) <= _MOST_FACTORS else 0)
+    found = [
+        (i, j, a, b) for i, j in itertools.combinations(few, 2) for a, b in ((1, 1), (2, 1), (1, 2))
+    ]
+    for number, difference in enumerate(motion.differences, len(names)):
+        inputs = [name for name in motion.inputs if name in names and name not in difference.names]
+        found += [(number, names.index(name), 1, 1) for name in inputs]
+    return found
 
 
 def values_of(tried: Tried, sizes: Sizes, rows: Matrix) -> Matrix:

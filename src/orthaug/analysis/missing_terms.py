@@ -114,8 +114,8 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
     A difference that the equations contain, such as the stroke of a spring between two masses, is
-    a variable, too. Where rows are many, products of two states or inputs are tried as well, and
-    terms that begin beyond a size of one. None where the runs have no slopes, or there are too few
+    a variable, too. Where rows are many, products of two states or inputs, and of a difference and an
+    input, are tried as well, and terms that begin beyond a size of one. None where the runs have no slopes, or there are too few
     rows.
     """
     if not fit.segmented.dynamics.differentiable:
@@ -218,7 +218,7 @@ def _missing_in(fit: MotionEstimate, equations: Sequence[int]) -> MissingTest | 
     forces = map(str, shared_forces(motion))
     names = (*motion.names_of_states, *measured, *motion.inputs, *forces)
     rows = int(fit.segmented.observations.sum())
-    tried = Tried(*variables_of(motion), products_of(motion.visible), _WIDTHS)
+    tried = Tried(*variables_of(motion), products_of(motion), _WIDTHS)
     for fewer in ({"products": []}, {"beyond": ()}):
         if rows < _ROWS_PER_PRODUCT * tried.count * len(equations):
             tried = tried._replace(**fewer)
