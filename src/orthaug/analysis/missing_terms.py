@@ -114,9 +114,9 @@ def missing_terms(fit: MotionEstimate) -> MissingTest | None:
     """Try terms of every state and input in every equation with parameters or a learner.
 
     A difference that the equations contain, such as the stroke of a spring between two masses, is
-    a variable, too. Where rows are many, products of two states or inputs, and of a difference and an
-    input, are tried as well, and terms that begin beyond a size of one. None where the runs have no slopes, or there are too few
-    rows.
+    a variable, too. Where rows are many, products of two states or inputs, and of a difference and
+    an input, are tried as well, and terms that begin beyond a size of one. None where the runs have
+    no slopes, or there are too few rows.
     """
     if not fit.segmented.dynamics.differentiable:
         return None
