@@ -232,6 +232,10 @@ class LaggedPlan(FitPlan[Problem]):
         check_types(lags=lags, learner=learner)
         if initial is not None and not initial.form.separates:
             raise InputError("`initial` is a motion, which has no regressor; fit anew.")
+        if initial is not None and not initial.form.bound.learns:
+            raise InputError(
+                "`initial` is physics alone and has nothing to start from; leave it out."
+            )
         channels = (
             tuple(channel.name for channel in group) for group in (record.outputs, record.inputs)
         )
@@ -524,8 +528,6 @@ def _warm_start(problem: Problem, model: Model, engine: Engine) -> tuple[OneStep
         raise InputError(
             "`initial` is an ensemble, which has no single weights to start from; fit anew."
         )
-    if not bound.learns:
-        raise InputError("`initial` is physics alone and has nothing to start from; leave it out.")
     if len(problem.outputs) != bound.ny:
         raise InputError(
             f"`initial` has {plural(bound.ny, 'output')}, the record {len(problem.outputs)}; fit "
