@@ -210,7 +210,9 @@ class Catalogue:
         names, features = motion.names_of_states, list(dict.fromkeys(features))
         hidden = {*names, *motion.inputs} - {*motion.visible}
         more = [text for text in features if text not in (*names, *motion.inputs)]
-        more += [text for text in map(str, motion.differences) if text not in more]
+        written = {text.replace(" ", "") for text in more}
+        apart = map(str, motion.differences)
+        more += [text for text in apart if text.replace(" ", "") not in written]
         places = tuple(motion.states[place].name for place in usual_places(motion))
         read = {
             place: motion.names_in(motion.equations[place])
