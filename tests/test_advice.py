@@ -1142,6 +1142,7 @@ def test_a_learner_that_sees_the_twist_of_a_free_shaft_is_proposed(tmp_path):
     (geared,) = proposed(SHAFT.replace("k*(a - l)", "k*(a/4 - l)"))
     assert geared.change == {"learner.inputs": ["a/4 - l", "w", "q", "rudder"]}
     assert proposed(SHAFT.replace("- b*w", "- b*w - b*a")) == []  # a spring holds the motor
+    assert proposed(SHAFT.replace("- b*w", "- b*w - (2*a - w - q)")) == []  # so does a longer sum
     assert proposed(SHAFT.replace('"k*(a - l)"', '"k*(a - l) + b*(rudder - l)"')) == []  # an input
     (proposal,) = proposed(SHAFT.replace("k*(a - l)", "k*(w - q)"))
     assert proposal.change == {"learner.inputs": ["w", "q", "rudder"]}

@@ -96,6 +96,12 @@ def _degrees(channel: Channel) -> bool:
     return plain and not math.isclose(abs(channel.scale), math.pi / 180, rel_tol=_NEAR)
 
 
+def _in_radians(channel: Channel) -> str:
+    """Return how the spec makes radians of a channel in degrees."""
+    scale = channel.scale * math.pi / 180
+    return f'Give `data.channels.{channel.name}` `unit = "rad"` and `scale = {scale:.6g}`'
+
+
 def _sines_of_degrees(
     expressions: tuple[Expression, ...], angles: dict[str, Channel]
 ) -> Iterator[tuple[str, str]]:
@@ -110,13 +116,11 @@ def _sines_of_degrees(
                         if channel is None or channel.name in said:
                             continue
                         said.add(channel.name)
-                        scale = channel.scale * math.pi / 180
                         yield (
                             channel.name,
                             f"{ast.unparse(node)} takes radians, and {channel.name} is in "
-                            f"{channel.unit}. The physics is then another one. Give "
-                            f'`data.channels.{channel.name}` `unit = "rad"` and '
-                            f"`scale = {scale:.6g}`, or write "
+                            f"{channel.unit}. The physics is then another one. "
+                            f"{_in_radians(channel)}, or write "
                             f"{function}({math.pi / 180:.6g}*({ast.unparse(argument)})).",
                         )
 
@@ -140,13 +144,12 @@ def _degrees_among_radians(motion: Motion, angles: dict[str, Channel]) -> Iterat
             if any(re.search("deg|°", units.get(name, "")) for name in names):
                 continue
             said.add(channel.name)
-            scale = channel.scale * math.pi / 180
             yield (
                 channel.name,
                 f"'{channel.name}' is in {channel.unit}, and {other} times it, {other} in "
                 f"{units[other]}, is in the equation of '{state}' in {unit}. The parameters absorb "
-                f'such a factor. Give `data.channels.{channel.name}` `unit = "rad"` and '
-                f"`scale = {scale:.6g}`, or give {other} a unit with {channel.unit}.",
+                f"such a factor. {_in_radians(channel)}, or give {other} a unit with "
+                f"{channel.unit}.",
             )
 
 

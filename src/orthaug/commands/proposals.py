@@ -508,18 +508,18 @@ def _free_differences(motion: Motion) -> list[Difference]:
     """
     trees = [one.tree for one in motion.equations.values()]
     trees += [one.tree for _, one in motion.definitions]
+    every = motion.differences
     held = {name for tree in trees for name in _names_by_themselves(tree, motion)}
     held |= {*motion.visible} - {*motion.visible_states}
-    every = motion.differences
     while joined := {name for one in every if held & one.names for name in one.names} - held:
         held |= joined
     return [one for one in every if not held & one.names]
 
 
 def _names_by_themselves(node: ast.AST, motion: Motion) -> Iterator[str]:
-    """Yield the names in an expression that are in no difference of two states or inputs."""
+    """Yield the names in an expression that are in none of the motion's differences."""
     found = difference_of(node, dict(motion.constants))
-    if found is not None and found.names <= {*motion.visible}:
+    if found is not None and any(found.sides == one.sides for one in motion.differences):
         return
     if isinstance(node, ast.Name):
         yield node.id

@@ -14,8 +14,8 @@ from orthaug._base.lines import with_unit
 from orthaug.data.channels import Channel
 from orthaug.data.expressions import Expression, Lag
 from orthaug.data.preparation import MENDING
-from orthaug.export.motion_nodes import NodesOfMotion, PhysicsNodes
 from orthaug.export.nodes import Apply, Entry, Name, Node, Number, apply, identifier, node_of, total
+from orthaug.export.physics_nodes import NodesOfMotion, PhysicsNodes
 from orthaug.export.program import Block, Constant, Layer, Network, Program, Scheme, Signal
 from orthaug.models.beyond import FADED
 from orthaug.models.dynamics import Numbers
@@ -237,10 +237,15 @@ def _weighted_terms(
     return sums, corrections
 
 
-def _motion_names(model: Model[MotionDynamics], constants: _Constants) -> dict[str, Node]:
-    """Return the meaning of the names of constants, parameters, states and inputs."""
-    form, motion = model.form, model.form.motion
-    values, _ = _values_of_parameters(model)
+def _motion_names(
+    form: MotionDynamics, values: Mapping[str, float], constants: _Constants
+) -> dict[str, Node]:
+    """Return the meaning of the names of constants, parameters, states and inputs.
+
+    Args:
+        values: of the parameters beside the learner.
+    """
+    motion = form.motion
     names: dict[str, Node] = {
         key: constants.node("c", key, value, f"constant {key}") for key, value in motion.constants
     }
@@ -301,8 +306,8 @@ def _split_parameters(values: Mapping[str, float], constants: _Constants) -> dic
 def _motion(model: Model[MotionDynamics], name: str, digest: str) -> Program:
     form, numbers, motion = model.form, model.numbers, model.form.motion
     constants = _Constants()
-    names = _motion_names(model, constants)
     beside, whole = _values_of_parameters(model)
+    names = _motion_names(form, beside, constants)
     physics = NodesOfMotion(form, dict(motion.constants), names, beside, constants.symbols)
     base = physics.at(names, beside)
     seen_names = physics.defined(names)

@@ -108,7 +108,6 @@ class ScalarProgram:
 
     operations: tuple[Operation, ...]
     calls: tuple[Call, ...]
-    shapes: tuple[tuple[int, ...], ...]
     outputs: tuple[np.ndarray, ...] = field(repr=False)  # numbers of operations
     single: bool
 
@@ -182,7 +181,7 @@ def scalar_program(
     with jax.ensure_compile_time_eval():  # what is known is a number, within a program, too
         outputs = making.run(traced.jaxpr, traced.consts, arguments)
     found = [making.lifted(each) for each in outputs]
-    return making.program(found, shapes, single=not isinstance(form, list | tuple))
+    return making.program(found, single=not isinstance(form, list | tuple))
 
 
 @dataclass(frozen=True)
@@ -221,9 +220,7 @@ class _Making:
         numbers = [self.constant(value) for value in array.ravel()]
         return np.array(numbers, np.int64).reshape(array.shape)
 
-    def program(
-        self, found: list[np.ndarray], shapes: Sequence[tuple[int, ...]], single: bool
-    ) -> ScalarProgram:
+    def program(self, found: list[np.ndarray], single: bool) -> ScalarProgram:
         """Return the operations that the outputs need, numbered anew."""
         needed: set[int] = set()
         waiting = [int(i) for each in found for i in each.ravel()]
@@ -235,7 +232,7 @@ class _Making:
         order = {old: new for new, old in enumerate(sorted(needed))}
         operations = tuple(_renumbered(self.operations[old], order) for old in order)
         outputs = tuple(np.vectorize(order.__getitem__, otypes=[int])(each) for each in found)
-        return ScalarProgram(operations, tuple(self.calls), tuple(shapes), outputs, single)
+        return ScalarProgram(operations, tuple(self.calls), outputs, single)
 
     def run(self, jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
         """Return the outputs of a traced function, known arrays or `_Scalars`."""

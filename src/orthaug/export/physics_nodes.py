@@ -40,7 +40,7 @@ class PhysicsNodes:
 
 @dataclass
 class NodesOfMotion:
-    """Physics of a motion at points and parameters that nodes stand for.
+    """Physics of a motion at points, and with parameters, that are nodes.
 
     Args:
         form: the motion with its learner.
@@ -147,7 +147,7 @@ class NodesOfMotion:
                 self.locals[local], self.symbols[local] = node, f"step_{i}"
                 node = Name(local)
             found.append(node)
-        return [[found[i] for i in numbers.ravel()] for numbers in program.outputs]
+        return [[found[i] for i in output.ravel()] for output in program.outputs]
 
 
 def _traced(form: MotionField) -> ScalarProgram:
